@@ -50,12 +50,6 @@ def arm():
 
 
 @pytest.fixture(scope="session")
-def wet_arm():
-    """The same in water, 1 m or more from any surface it can reach."""
-    return arm_robot(world(**WATER))
-
-
-@pytest.fixture(scope="session")
 def elbow():
     """The smallest body with two hinges, in water."""
     return elbow_robot(world(**WATER))

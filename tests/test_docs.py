@@ -2,7 +2,6 @@
 
 import ast
 import builtins
-import collections
 import graphlib
 import importlib
 import inspect
@@ -311,15 +310,6 @@ def test_things_are_not_persons():
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
             wrong += [(path, number, x) for x in re.findall(NOT_PROSE, line)]
     assert [f"{path.relative_to(ROOT)}:{number}: {x}" for path, number, x in wrong] == []
-
-
-def test_no_two_public_classes_have_one_name():
-    homes = collections.defaultdict(list)
-    for path in PACKAGE.rglob("*.py"):
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                homes[node.name].append(str(path.relative_to(PACKAGE)))
-    assert {name: files for name, files in homes.items() if len(files) > 1} == {}
 
 
 def run_script(name, *arguments):

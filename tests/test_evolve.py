@@ -208,14 +208,6 @@ def test_a_changed_robot_or_config_is_noticed(stopped, capsys, monkeypatch):
     )
 
 
-def test_another_host_is_mentioned(stopped, capsys, monkeypatch):
-    host = beginning.describe_host()
-    monkeypatch.setattr(beginning, "describe_host", lambda: host | {"cpu_count": 999})
-    assert run_main("--resume", "run") == 0
-    err = capsys.readouterr().err
-    assert "continues, but not bit for bit, because this process differs: cpu_count" in err
-
-
 @pytest.mark.parametrize(
     ("argv", "message"),
     [

@@ -8,11 +8,9 @@ from experiments import (
     bench,
     falling_spider,
     gpu,
-    gradient_learning,
     optimisers,
     policy_gradient,
     precision,
-    sensitivity,
     shipped,
     validation,
     validation_cases,
@@ -150,17 +148,6 @@ def test_work_at_an_error_lies_between_the_steps():
     assert precision.work_at([{**points[0], "error_percent": None}, *points[1:]], 2.0) == 200
 
 
-def test_every_row_of_the_benchmark_can_be_made():
-    from experiments.bench_cases import MAKERS, PHYSICS
-
-    for group in (*bench.GROUPS, bench.QUICK, bench.PARTS):
-        assert len(group.rows) > group.against
-        for row in group.rows:
-            assert row.engine in MAKERS
-            assert row.physics in PHYSICS
-            assert (ROOT / "morphologies" / f"{row.robot}.yaml").is_file()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", optimisers.OPTIMISERS)
 def test_each_library_maximises(name):
@@ -204,25 +191,6 @@ def test_a_case_outside_its_tolerance_fails_the_validation(tmp_path, monkeypatch
     assert "FAILS" in (tmp_path / "out" / "validation.csv").read_text(encoding="utf-8")
 
 
-def test_the_tables_and_the_picture_of_sensitivity():
-    swim = sensitivity.Swim(np.array([0.05, 0.07]), np.array([0.1, -0.3]))
-    rows = sensitivity.table(
-        {"ours, all laws": swim, "no drag": swim._replace(speed=swim.speed / 2)}
-    )
-    assert rows[2][:2] == ["no drag", "3.00"] and rows[2][3] == "-50.0 %"
-    curves = {name: (np.array([0.5, 1.0, 2.0]), swim._replace(speed=np.ones(3)))
-              for name in sensitivity.RANGES}  # fmt: skip
-    found = sensitivity.Sensitivity(0.06, curves, {"start": swim, "drag": swim})
-    assert sensitivity.intervals(found, 0.25)[1][-1] == "50%"
-    assert len(sensitivity.draw(found, {"other": found}).axes) == 2
-    numbers = sensitivity.results_of({"ours, all laws": swim}, found, {"other": found})
-    assert numbers["laws"][0]["speed"] == pytest.approx(6) and numbers["laws"][0]["change"] == 0
-    assert [row["name"] for row in numbers["draws"]] == ["start", "drag"]
-    for prefix in ("", "robust_"):
-        assert numbers["draws"][1][f"{prefix}median"] == pytest.approx(6)
-        assert numbers["draws"][1][f"{prefix}kept"] == pytest.approx(0.051 / 0.06)
-
-
 def test_advantages_by_hand():
     """Two environments; the first one's episode is over after the second of three steps."""
     settings = policy_gradient.Settings(discount=0.5, trace=0.5)
@@ -236,11 +204,3 @@ def test_advantages_by_hand():
     # the later one's advantage.
     assert found[:, 1].tolist() == [0.5 + 0.25 * 3.0, 2.0 + 0.25 * 4.0, 4.0]
     assert found[:, 0].tolist() == [0.5 + 0.25 * 1.0, 1.0, 4.0]
-
-
-def test_a_gradient_is_no_longer_than_the_median_of_its_individuals():
-    """By hand: lengths 1, 5 and beyond float32; of the other individual all are 2."""
-    slope = np.array([[[1, 0], [3, 4], [3e30, 0]], [[2, 0], [0, 2], [0, -2]]], np.float32)
-    found = np.asarray(gradient_learning.clip_gradients(jnp.asarray(slope)))
-    assert found[0] == pytest.approx(np.array([[1, 0], [0.6, 0.8], [0, 0]]), abs=1e-6)
-    np.testing.assert_array_equal(found[1], slope[1])

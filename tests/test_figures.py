@@ -6,9 +6,7 @@ import re
 import pytest
 import yaml
 
-from experiments.common import as_numbers
 from laboratory import ROOT
-from mjx_revolve.view.statistics import interval
 
 spec = importlib.util.spec_from_file_location("figures_of_docs", ROOT / "docs" / "figures.py")
 figures = importlib.util.module_from_spec(spec)
@@ -102,15 +100,6 @@ def test_what_is_no_measured_figure_is_left_alone(text):
     assert list(figures.find_figures(f"Before, {text}.", [])) == []
 
 
-def test_constants_stand_in_their_words_only():
-    text = "Limits: at most\n0.5 m. Again 0.5 m.\n\n| key | default |\n|---|---|\n| `x` | 3 |\n"
-    found = list(figures.find_figures(text, ["at most 0.5 m", "| key | default |"]))
-    assert found == [(2, "'0.5' is in no results file")]
-    assert [w for _, w in figures.find_figures("", ["at most 0.5 m"])] == [
-        "'at most 0.5 m' of docs/constants.yaml is not here any more"
-    ]
-
-
 def test_constants_have_reasons_and_words_of_their_page():
     constants = yaml.safe_load((ROOT / "docs" / "constants.yaml").read_text(encoding="utf-8"))
     assert {*constants} <= {page.name for page in figures.PAGES}
@@ -120,35 +109,3 @@ def test_constants_have_reasons_and_words_of_their_page():
             for fragment in fragments:
                 # A figure alone would allow it anywhere.
                 assert re.search(r"[^\W\d_]{3}", fragment), f"{page}: {fragment}"
-
-
-def test_a_marked_place_does_not_begin_a_line():
-    """There a renderer takes the whole line for HTML, and no text."""
-    found = list(figures.find_figures("It swims\n<!--n {swim.score}-->1<!--/--> far.", []))
-    assert found == [(2, "a line begins with a marked place")]
-
-
-@pytest.mark.parametrize("page", figures.PAGES, ids=lambda page: page.name)
-def test_marked_places_do_not_disturb_what_is_rendered(page):
-    """As GitHub renders it: the same without them."""
-    markdown = pytest.importorskip("markdown_it").MarkdownIt("commonmark").enable("table")
-    text = page.read_text(encoding="utf-8")
-    plain = figures._MARK.sub(lambda mark: mark[4], text)
-    rendered = re.sub(r"<!--.*?-->", "", markdown.render(text), flags=re.S)
-    assert rendered.split() == markdown.render(plain).split()
-
-
-def test_results_say_what_they_depend_on():
-    for name, result in figures.read_results().items():
-        assert result["study"] == name
-        assert re.fullmatch(r"20\d\d-\d\d-\d\d", result["date"])
-        assert {"versions", "machine", "seeds", "numbers"} <= {*result}
-        assert "mjx_revolve" in result["versions"]
-
-
-def test_an_interval_that_is_not_known_is_null():
-    assert as_numbers(interval([0.1, 0.3])) == {
-        "mean": pytest.approx(0.2), "half": pytest.approx(1.27, abs=0.01), "size": 2,
-        "text": "0.2 ± 1.3",
-    }  # fmt: skip
-    assert as_numbers(interval([])) == {"mean": None, "half": None, "size": 0, "text": "–"}

@@ -3,14 +3,13 @@
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
 import yaml
 
 from laboratory import ROOT
 from mjx_revolve import inspect
 from mjx_revolve.body.morphology import load_morphology
-from mjx_revolve.body.table import module_table, thruster_table
+from mjx_revolve.body.table import thruster_table
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 
@@ -69,24 +68,6 @@ def test_the_spider_weighs_what_the_thesis_says(spider, capsys):
     assert "(sinks)" in out
 
 
-def test_the_table_is_aligned_with_units_in_its_header(spider):
-    lines = module_table(load_morphology(spider))
-    assert len(lines) == 2 + 17
-    assert lines[0].split() == [
-        "#", "name", "type", "parent", "slot", "turn", "x", "y", "z", "mass", "volume"
-    ]  # fmt: skip
-    assert lines[1].split() == ["(deg)", "(m)", "(m)", "(m)", "(kg)", "(cm³)"]
-    assert len({len(line) for line in lines}) == 1  # the last column is set to the right
-    # The foot along +x: x .17905, as in Revolve's SDF; brick 10.70 cm³, .0102 kg.
-    foot = next(line.split() for line in lines if " foot2 " in line)
-    assert foot[2:] == [
-        "FixedBrick", str(int(foot[0]) - 1), "1", "0", "0.17905", "0.00000", "0.00000",
-        "0.0102", "10.700",
-    ]  # fmt: skip
-    core = lines[2].split()
-    assert core == ["0", "core", "Core", "-", "-", "-", *["0.00000"] * 3, "0.0900", "50.540"]
-
-
 def test_descriptors_are_listed(spider, capsys):
     assert run(spider) == 0
     out = capsys.readouterr().out
@@ -142,34 +123,6 @@ def test_the_picture_is_a_whole_png_in_the_robots_colours(spider, tmp_path):
     white = (pixels > 0.99).all(axis=-1)
     assert 0.01 < blue.mean() < 0.3  # core and bricks
     assert 0.3 < white.mean() < 0.9
-
-
-@pytest.mark.slow
-def test_thrusts_are_drawn_as_green_arrows(tmp_path):
-    from matplotlib.image import imread
-
-    share = {}
-    for name in ("auv", "fish"):
-        assert run(ROOT / "morphologies" / f"{name}.yaml", "--picture", tmp_path / "a.png") == 0
-        red, green, blue = np.moveaxis(imread(tmp_path / "a.png")[..., :3], -1, 0)
-        share[name] = ((green > 1.6 * red) & (green > 1.6 * blue) & (green > 0.3)).mean()
-    assert share["auv"] > 1e-3
-    assert share["fish"] == 0.0
-
-
-def test_what_is_nearer_hides_what_is_farther():
-    from mjx_revolve.view.raster import depth_buffer
-
-    square = np.array([[(0, 0), (4, 0), (4, 4)], [(0, 0), (4, 4), (0, 4)]], float)
-    low = np.concatenate([square, np.zeros((2, 3, 1))], axis=2)
-    high = np.concatenate([0.5 * square + 1, np.ones((2, 3, 1))], axis=2)
-    for corners, near in ((np.concatenate([low, high]), 2), (np.concatenate([high, low]), 0)):
-        depth, index = depth_buffer(corners, np.zeros(2), 0.1, (40, 40))
-        assert (depth[10:30, 10:30] == 1.0).all()
-        assert (depth == 1.0).sum() == 400 and (depth == 0.0).sum() == 1200
-        assert np.isin(index[10:30, 10:30], (near, near + 1)).all()
-    depth, _ = depth_buffer(low[:, ::-1], np.zeros(2), 0.1, (40, 40))
-    assert not np.isfinite(depth).any()  # faces that look away are not drawn
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,6 @@
 
 import csv
 import json
-import os
-import signal
 
 import numpy as np
 import pytest
@@ -110,22 +108,6 @@ def test_a_study_runs_what_is_left_and_reports_it(tmp_path, started, monkeypatch
     for name in ("bodies", "figures", "curves"):
         picture = tmp_path / f"environments_{name}.png"
         assert picture.read_bytes().startswith(b"\x89PNG")
-
-
-def test_a_study_that_is_interrupted_says_how_it_goes_on(tmp_path, started, monkeypatch, capsys):
-    """Ctrl-C while the first picture is drawn: that run is finished, the next is not begun."""
-
-    def interrupt(start, champion):
-        os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(studies, "save_pictures", interrupt)
-    options = ("--only", "bed,shore", "--generations", "1")
-    assert study(tmp_path, *options) == 130
-    printed = capsys.readouterr().out
-    assert printed.startswith("[1/2] shore/seed_0: running ... ")
-    assert "\ngo on: python -m experiments.environments --out" in printed
-    assert not (tmp_path / "bed").exists()
-    monkeypatch.undo()
 
 
 def test_environments_are_what_they_are_called():

@@ -6,7 +6,6 @@ Bits are compared within one process or on one machine with the same thread sett
 import csv
 import os
 import re
-import shutil
 import signal
 
 import pytest
@@ -14,7 +13,7 @@ import pytest
 import toys
 from mjx_revolve import evolve, report, sweep
 from mjx_revolve.evolution.run_folder import RunFolder
-from mjx_revolve.evolution.sweeps import Sweep, read_sweep, write_sweep
+from mjx_revolve.evolution.sweeps import Sweep
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.view.report.sweep import case_words
 from mjx_revolve.view.statistics import interval
@@ -107,13 +106,6 @@ def test_a_sweep_is_a_grid_of_ordinary_runs_with_one_report(folder, no_pictures,
     assert run_command(report.main, ["out", "alone"]) == 2
 
 
-def test_seeds_may_begin_later(tmp_path):
-    sweep = Sweep("lake_swim", 2, first_seed=7)
-    write_sweep(tmp_path, sweep)
-    assert read_sweep(tmp_path) == sweep
-    assert [plan.seed for plan in sweep.plans(tmp_path)] == [7, 8]
-
-
 def test_cases_have_names_to_read():
     grid = Sweep("a.yaml", 2, ("bodies.modules=[ActiveHinge],[FixedBrick,ActiveHinge]",
                                "morphology=m/spider.yaml,gecko"))  # fmt: skip
@@ -159,41 +151,6 @@ def test_ctrl_c_stops_after_the_generation_under_way(folder, capsys):
     page = (folder / "out" / "report.html").read_text()
     assert "1 of 4</b>runs finished" in page
     assert (page.count("not finished</td>"), page.count("not begun</td>")) == (1, 2)
-
-
-@pytest.mark.slow
-def test_a_run_killed_before_its_first_checkpoint_begins_anew(folder, no_pictures, capsys):
-    one = ("toy.yaml", "--seeds", "1", "--out", "out")
-    assert run_sweep(*one) == 0
-    run = folder / "out" / "toy" / "seed_0"
-    whole = contents(run)
-
-    for path in (*run.glob("checkpoints/*"), *run.glob("champion/*")):
-        path.unlink()
-    (run / ".4711-run.json").write_text("half")
-    RunFolder(run).update_info(finished=None)
-    assert run_sweep(*one) == 0  # before its first checkpoint
-    assert contents(run) == whole
-    for there in ({".lock", "inputs"}, {".lock", "inputs", "run.json"}):  # while it was made
-        for path in run.iterdir():
-            if path.name not in there:
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
-        (run / ".4711-config.yaml").write_text("half")
-        assert run_sweep(*one) == 0
-        assert contents(run) == whole
-
-    # Nothing of the user's is removed.
-    (run / "thesis.txt").write_text("years of work")
-    for path in run.glob("checkpoints/*"):
-        path.unlink()
-    RunFolder(run).update_info(finished=None)
-    assert run_sweep(*one) == 0
-    assert (run / "thesis.txt").read_text() == "years of work"
-    (run / "run.json").unlink()
-    capsys.readouterr()
-    assert run_sweep(*one) == 2
-    assert "expected a run folder; found no run.json in it" in capsys.readouterr().err
-    assert (run / "thesis.txt").read_text() == "years of work"
 
 
 @pytest.mark.parametrize(
@@ -255,17 +212,3 @@ def test_what_is_no_sweep_has_no_report(text, message, folder, capsys):
     captured = capsys.readouterr()
     assert message in captured.err
     assert captured.err.count("\n") == 1
-
-
-@pytest.mark.slow
-def test_a_damaged_run_is_named_and_the_others_are_reported(folder, no_pictures, capsys):
-    settings = ("--set", "controller.amplitude=0.5,1.0", "--set", "task.measures=[depth_m],[]")
-    assert run_sweep("toy.yaml", "--seeds", "1", "--out", "o<b>", *settings) == 0
-    damaged = next((folder / "o<b>").glob("*/seed_0/run.json"))
-    damaged.write_text("[")
-    assert run_command(report.main, ["o<b>"]) == 0
-    assert "expected a whole run; found: " in capsys.readouterr().err
-    page = (folder / "o<b>" / "report.html").read_text()
-    assert "3 of 4</b>runs finished" in page
-    assert "damaged</td>" in page
-    assert "<b>/" not in page  # names are text

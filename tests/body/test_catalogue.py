@@ -114,19 +114,6 @@ def test_ballast_moves_the_centres_of_mass_and_volume():
     assert (kind.mass, kind.volume) == pytest.approx((0.4, 4e-4))
 
 
-def test_what_weighs_or_displaces_nothing_has_its_centres_in_the_middle():
-    part = Part("p", (Box((1, 1, 1)),), mass=0.0, volume=0.0)
-    assert part.center_of_mass == part.displaced_center == (0.0, 0.0, 0.0)
-
-
-def test_faces_of_a_single_box_are_its_faces():
-    part = Part("p", (Box((2.0, 3.0, 5.0)),), 1.0, 30.0)
-    assert part.face_areas == pytest.approx([15.0, 10.0, 6.0])
-    low, high = part.bounds
-    assert low == pytest.approx([-1.0, -1.5, -2.5])
-    assert high == pytest.approx([1.0, 1.5, 2.5])
-
-
 def test_faces_count_shared_silhouettes_once():
     # Two unit cubes: the second half a unit to the right and 2 up.
     part = Part("p", (Box((1, 1, 1)), Box((1, 1, 1), (0.5, 0.0, 2.0))), 1.0, 1.0)

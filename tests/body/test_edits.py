@@ -230,16 +230,6 @@ def test_edits_that_make_no_body_are_refused(case):
     assert "\n" not in str(error.value)
 
 
-def test_overlaps_are_kept_where_they_are_allowed():
-    body = graft_subtree(HOOK, "b", 2, HOOK, "b", allow_overlap=True)
-    assert ("core", "b_2") in body.overlaps
-    assert body.overlaps == make_morphology(body.to_mapping(), allow_overlap=True).overlaps
-    # An edit elsewhere neither mends nor minds them; removing what overlaps does.
-    more = add_module(body, "core", 3, "FixedBrick")
-    assert more.overlaps == body.overlaps
-    assert remove_module(more, "b_2").overlaps == ()
-
-
 def random_edit(body: Morphology, draw: np.random.Generator) -> list[Morphology]:
     """One random edit with random arguments, some of them wrong."""
     index = int(draw.integers(0, body.num_modules))

@@ -9,7 +9,7 @@ import trimesh
 
 from experiments import module_volumes as experiment
 from experiments.meshes import check_mesh, load_mesh, mesh_center_of_volume, mesh_volume
-from mjx_revolve.body.catalogue import MODULES, THESIS_MODULES, Box
+from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.solids import part_mesh
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.trust import audited_by
@@ -274,44 +274,9 @@ def test_a_shell_has_the_volume_of_walls_less_windows():
     assert mesh_volume(mesh) == pytest.approx(expected, rel=1e-6)
 
 
-def test_boxes_that_overlap_are_drawn_once():
-    kind = MODULES["Core"]
-    part = replace(
-        kind.parts[0],
-        boxes=(Box((0.04, 0.04, 0.04), (0, 0, 0)), Box((0.04, 0.04, 0.04), (0.02, 0.01, 0.0))),
-        volume=6.4e-5 * 1.625,  # the union: the second box adds 1 - 1/2 x 3/4 of its volume
-    )
-    mesh = part_mesh(replace(kind, name="Twin"), part)
-    check_mesh(mesh)
-    assert mesh_volume(mesh) == pytest.approx(6.4e-5 * 1.625, rel=1e-9)
-    np.testing.assert_allclose(mesh.bounds, [(-0.02, -0.02, -0.02), (0.04, 0.03, 0.02)], atol=1e-6)
-
-
 def test_a_part_that_displaces_nothing_is_drawn_all_the_same():
     kind = MODULES["FixedBrick"]
     part = replace(kind.parts[0], volume=0.0)
     mesh = part_mesh(kind, part)
     check_mesh(mesh)
     assert mesh_volume(mesh) == pytest.approx(1e-3 * part.box_volume, rel=1e-6)
-
-
-def test_the_thesis_variant_is_drawn_like_the_catalogue():
-    for name, kind in THESIS_MODULES.items():
-        for mine, theirs in zip(kind.parts, MODULES[name].parts, strict=True):
-            assert mesh_volume(part_mesh(kind, mine)) == pytest.approx(theirs.volume, rel=5e-3)
-
-
-def test_the_experiment_recomputes_the_table(capsys):
-    rows = experiment.rows()
-    assert len(rows) == len(experiment.TABLE)
-    densities = {row["part"]: row["density"] for row in rows}
-    for row in rows:
-        assert abs(row["difference"]) < 0.5
-        assert row["trimesh"] == pytest.approx(row["computed"], rel=1e-9)
-        assert row["moved"] == pytest.approx(row["computed"], rel=1e-9)
-        assert abs(row["printed_moved"] / row["computed"] - 1) > 0.5
-    assert sorted(densities.values()) == pytest.approx(
-        [560.7, 887.6, 953.3, 1096.9, 1780.8], rel=2e-4
-    )
-    assert experiment.main([]) == 0
-    assert "Erratum" in capsys.readouterr().out

@@ -13,7 +13,6 @@ import yaml
 
 from laboratory import ROOT
 from mjx_revolve.body.catalogue import MODULES, THESIS_MODULES, LiftDrag
-from mjx_revolve.body.descriptors import UNITS
 from mjx_revolve.body.exposure import exposure
 from mjx_revolve.body.morphology import (
     MAX_MODULES,
@@ -101,18 +100,6 @@ def test_spider_hips_are_vertical_and_knees_across_the_leg(spider, slot):
     assert thigh.rotation[:, 2] == pytest.approx([0, 0, 1])
 
 
-def test_spider_totals(spider):
-    assert (spider.num_modules, spider.num_hinges) == (17, 8)
-    assert spider.mass == pytest.approx(0.2572, abs=1e-12)
-    assert spider.volume == pytest.approx(2.41516e-4, rel=1e-12)
-    assert WATER * spider.volume / spider.mass == pytest.approx(0.93818, abs=5e-6)
-    # With the boxes' volumes it would shoot up at 27.6 m/s².
-    assert 9.81 * (WATER * spider.box_volume / spider.mass - 1) == pytest.approx(27.6, abs=0.05)
-    reach = SECOND_BRICK + 0.041 / 2
-    assert spider.extent == pytest.approx([2 * reach, 2 * reach, 0.045])
-    assert spider.length == pytest.approx(2 * reach)
-
-
 def link_masses(morphology: Morphology) -> list[float]:
     """Masses of what is welded together: a hinge's first part stays, the rest moves."""
     carrier: list[int] = []
@@ -126,10 +113,6 @@ def link_masses(morphology: Morphology) -> list[float]:
         masses[link] += sum(part.mass for part in parts)
         carrier.append(link)
     return sorted(masses.values())
-
-
-def test_spider_links(spider):
-    assert link_masses(spider) == pytest.approx([0.0192] * 4 + [0.0209] * 4 + [0.0968])
 
 
 def test_thesis_masses_move_between_links_only():
@@ -190,24 +173,6 @@ def test_our_robots_are_what_they_promise():
         assert trim_neutral(robot, WATER).volume * WATER == pytest.approx(robot.mass)
 
 
-@pytest.mark.parametrize(
-    "name, modules, hinges",
-    [
-        ("babyA", 16, 8),
-        ("gecko", 13, 6),
-        ("robot_5", 7, 2),
-        ("snake", 9, 4),
-        ("spider", 17, 8),
-        ("spider17", 33, 16),
-    ],
-)
-def test_wild_robots_load(name, modules, hinges, tmp_path):
-    robot = load_morphology(wild(name))
-    assert (robot.num_modules, robot.num_hinges) == (modules, hinges)
-    assert len({m.name for m in robot.modules}) == modules
-    check_round_trip(robot, tmp_path)
-
-
 def test_wild_brains_are_kept():
     assert load_morphology(wild("gecko")).brain == {"type": "rlpower-splines"}
     assert load_morphology(wild("spider17")).brain is None
@@ -258,11 +223,6 @@ def test_loose_spellings_are_understood(tmp_path, caplog):
     assert robot.modules[3].params == {"mass": 0.02, "note": "kept;", "lift;": 3}
     assert robot.modules[4].type == "TouchSensor"
     assert robot.brain == ["neurons", 1e-3]
-
-
-def test_a_file_without_id_is_named_after_itself(tmp_path):
-    text = "body: {type: Core}"
-    assert load_morphology(write(tmp_path, text, "eel.yaml")).name == "eel"
 
 
 @pytest.mark.parametrize("a, b", [(-90, 270), (90, -270), (180, -180), (0, "0;")])
@@ -440,40 +400,6 @@ def test_a_dead_band_is_scaled_on_both_sides(tmp_path):
     assert [part.thruster.thrust_at(x) for x in (-1, 0.7, 1)] == [-2.0, 0.0, 4.0]
 
 
-def test_the_auv_pushes_up_and_ahead_without_torque():
-    robot = ours("auv")
-    force, torque = np.zeros((4, 3)), np.zeros((4, 3))
-    for i, (index, k) in enumerate(robot.thrusters):
-        module = robot.modules[index]
-        thruster = module.kind.parts[k].thruster
-        force[i] = module.rotation @ np.array(thruster.axis) * thruster.thrust_at(1.0)
-        torque[i] = np.cross(module.position, force[i]) - thruster.torque_ratio * force[i]
-    up, ahead = slice(0, 2), slice(2, 4)
-    assert force[up].sum(0) == pytest.approx([0, 0, 1]) and torque[up].sum(0) == pytest.approx(0)
-    assert force[ahead].sum(0) == pytest.approx([0, 1, 0])
-    assert torque[ahead].sum(0) == pytest.approx(0)
-    # Against each other: pitch about x with bow and stern, yaw about z with the sides.
-    assert (torque[0] - torque[1])[0] == pytest.approx(0.0595)
-    assert (torque[2] - torque[3])[2] == pytest.approx(0.0595)
-
-
-def test_the_fish_has_a_tail_that_beats_sideways():
-    robot = ours("fish")
-    tail = robot.modules[robot.num_modules - 3]
-    plate = tail.kind.parts[0].lift_drag
-    assert tail.rotation @ np.array(plate.forward) == pytest.approx([0, 1, 0])
-    assert np.abs(tail.rotation @ np.array(plate.upward)) == pytest.approx([1, 0, 0])
-    for i in robot.hinges:
-        hinge = robot.modules[i]
-        assert np.abs(hinge.rotation @ hinge.kind.hinge.axis) == pytest.approx([0, 0, 1])
-    for name in ("right_fin", "left_fin"):
-        (fin,) = [m for m in robot.modules if m.name == name]
-        plate = fin.kind.parts[0].lift_drag
-        assert fin.rotation @ np.array(plate.forward) == pytest.approx([0, 1, 0])
-        assert fin.rotation @ np.array(plate.upward) == pytest.approx([0, 0, 1])
-    assert robot.hinge_neighbours() == ((0, 1), (1, 2))
-
-
 @pytest.mark.parametrize("name", ["auv", "fish"])
 def test_swimmers_with_ballast_are_neutral_level_and_upright(name):
     robot = ours(name)
@@ -586,26 +512,6 @@ def test_random_trees_round_trip(seed, tmp_path):
     assert all(math.isfinite(x) for x in robot.descriptors.values())
 
 
-def test_equality_sees_every_field(tmp_path):
-    base = (
-        "id: a\nbody: {type: Core, id: c, params: {ballast: 1}, children: {1: {type: FixedBrick}}}"
-    )
-    robot = read(tmp_path, base)
-    assert robot == read(tmp_path, base)
-    assert robot != 1
-    for old, new in [
-        ("id: a", "id: b"),
-        ("id: c", "id: d"),
-        ("ballast: 1", "ballast: 2"),
-        ("{1: {type: F", "{2: {type: F"),
-        ("FixedBrick", "ActiveHinge"),
-        ("FixedBrick", "FixedBrick, orientation: 90"),
-        ("FixedBrick", "FixedBrick, params: {red: 1, green: 1, blue: 1}"),
-        ("\nbody", "\nbrain: {}\nbody"),
-    ]:
-        assert robot != read(tmp_path, base.replace(old, new))
-
-
 # A brick on each side of the core's front, and from one of them a chain that turns back into it.
 RING = """
 body:
@@ -637,28 +543,6 @@ def test_overlapping_modules_are_named(tmp_path):
     assert robot.overlaps == (("Core0", "c"), ("Core0", "d"))
 
 
-def test_bricks_side_by_side_do_not_overlap(tmp_path):
-    # Four bricks in a square, and neighbours on one brick: boxes share 3 mm by design.
-    text = """
-body:
-  type: Core
-  children:
-    1:
-      type: FixedBrick
-      children:
-        1:
-          type: FixedBrick
-          children:
-            2: {type: FixedBrick, children: {2: {type: FixedBrick, id: fourth}}}
-            3: {type: FixedBrick}
-            1: {type: FixedBrick}
-"""
-    assert read(tmp_path, text).overlaps == ()
-    fifth = "id: fourth, children: {1: {type: FixedBrick, id: fifth}}"  # reaches into the core
-    with pytest.raises(InputError, match="overlapping: Core0 and fifth"):
-        read(tmp_path, text.replace("id: fourth", fifth))
-
-
 def test_descriptors_of_the_spider(spider):
     found = spider.descriptors
     expected = {
@@ -679,28 +563,6 @@ def test_descriptors_of_the_spider(spider):
     assert {key: found[key] for key in expected} == pytest.approx(expected)
     assert found["mass"] == spider.mass
     assert found["coverage"] == pytest.approx(spider.box_volume / np.prod(spider.extent))
-
-
-def test_descriptors_of_a_core():
-    found = ours("core").descriptors
-    zero = ("limbs", "branching", "joints", "sensors", "symmetry", "chain_length", "num_limbs")
-    assert all(found[key] == 0 for key in zero)
-    assert found["coverage"] == pytest.approx(1.0)
-
-
-def test_thrusters_and_fins_are_counted():
-    auv, fish = ours("auv").descriptors, ours("fish").descriptors
-    expected = {"num_thrusters": 4, "num_fins": 0, "num_bricks": 0, "num_limbs": 4, "symmetry": 1}
-    assert {key: auv[key] for key in expected} == expected
-    expected = {"num_thrusters": 0, "num_fins": 3, "num_bricks": 2, "num_limbs": 3, "symmetry": 1}
-    assert {key: fish[key] for key in expected} == expected
-
-
-def test_symmetry_needs_a_mirror_image(tmp_path):
-    text = "body: {type: Core, children: {2: {type: FixedBrick}%s}}"
-    assert read(tmp_path, text % "").descriptors["symmetry"] == 0
-    assert read(tmp_path, text % ", 3: {type: FixedBrick}").descriptors["symmetry"] == 1
-    assert read(tmp_path, text % ", 3: {type: ActiveHinge}").descriptors["symmetry"] == 0
 
 
 # Bodies by their children, and what counting by hand says of them.
@@ -751,11 +613,6 @@ def test_descriptors_counted_by_hand(tmp_path, name):
     children, expected = COUNTED[name]
     found = read(tmp_path, f"body: {{type: Core, children: {{{children}}}}}").descriptors
     assert {key: found[key] for key in expected} == pytest.approx(expected)
-
-
-def test_every_descriptor_has_a_unit(spider):
-    assert list(UNITS) == list(spider.descriptors)
-    assert all(UNITS.values())
 
 
 HINGE_ON = "body: {type: Core, children: {1: {type: ActiveHinge, %s}}}"
@@ -817,17 +674,6 @@ def test_wrong_files_are_refused(tmp_path, text, message):
 def test_a_mapping_is_refused_as_a_file_is():
     with pytest.raises(InputError, match=r"^mine: body: expected modules that do not overlap"):
         make_morphology(yaml.safe_load(RING), source="mine")
-
-
-def test_a_body_shares_nothing_with_its_mapping():
-    tree = {"type": "Core", "params": {"note": ["a"], "ballast_position": [0, 0, 0]}}
-    mapping = {"body": tree, "brain": {"type": ["b"]}}
-    robot = make_morphology(mapping)
-    tree["params"]["note"].append("c")
-    mapping["brain"]["type"].append("c")
-    robot.to_mapping()["body"]["params"]["note"].append("c")
-    robot.to_mapping()["brain"]["type"].append("c")
-    assert robot.modules[0].params["note"] == ["a"] and robot.brain == {"type": ["b"]}
 
 
 @pytest.mark.parametrize("path", OURS, ids=lambda p: p.stem)

@@ -11,7 +11,7 @@ import yaml
 from laboratory import WILD, read, world
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.control.kinds import find_controller
-from mjx_revolve.control.neurons import evolve_brain, make_neural_network, read_neural_network
+from mjx_revolve.control.neurons import evolve_brain, make_neural_network
 from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import build_robot
@@ -183,8 +183,3 @@ def test_what_a_file_may_have_for_a_brain(robot):
         assert message in str(caught.value)
     with pytest.raises(InputError, match=r"run.yaml: controller.type: expected another one, as"):
         find_controller(plant, settings, "run.yaml")
-
-
-def test_inputs_by_list_and_without_a_type():
-    brain = {"neurons": [{"id": 1, "layer": "input", "part_id": "core"}]}
-    assert read_neural_network(brain, "x").neurons[0].type == "Input"

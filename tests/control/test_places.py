@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-import yaml
 
 from laboratory import (
     OAR,
@@ -21,7 +20,6 @@ from laboratory import (
     world,
 )
 from mjx_revolve.body.catalogue import MODULES, load_modules
-from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.body.sensors import Sensor, SensorRow
 from mjx_revolve.control.readings import EpisodeContext, init_memory, read_sensors
 from mjx_revolve.control.sensors import DEFAULT_SENSORS, make_observer, resolve_sensors
@@ -32,7 +30,6 @@ from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.config import OLDER, OLDER_TASK, make_config
-from mjx_revolve.episodes.fitness import fit_body, make_mixed_fitness
 from mjx_revolve.evolution.fingerprints import settings_hash
 from mjx_revolve.inputs import schema
 from mjx_revolve.inputs.errors import InputError
@@ -287,7 +284,6 @@ body:
     3: {id: other, type: FixedBrick}
 """
 GROUND = world(gravity=9.81, bed={"height": -1.0})
-MUD = world(**WATER | {"bed": {"height": -1.0}})
 STIFF = GROUND.bed.stiffness
 
 
@@ -364,29 +360,6 @@ def test_a_box_at_rest_presses_its_halves_as_in_mujoco():
     assert np.concatenate(cells) == pytest.approx(lever, rel=1e-3)
 
 
-@pytest.mark.slow
-def test_the_beds_force_on_a_body_counts_what_rides_on_it():
-    """In a batch, bodies of many parts fill several rows; alone, one."""
-    robot, other = build_robot(read(PADS), MUD), elbow_robot(MUD)
-    capacity = fit_capacity([robot, other], hinges=2, modules=8)
-    bodies = pack_bodies([robot, other, robot], capacity, np.float64)
-    qpos = np.zeros((7 + 2, 3))
-    qpos[3], qpos[2] = 1.0, (-0.99, -0.985, -0.987)
-
-    def many():
-        plant = jax.tree.map(jnp.asarray, bodies.plant)
-        return PopulationEngine(make_batched_trees(MUD, capacity, bodies, 3), plant)
-
-    assert bodies.count.max() > robot.num_hinges  # some row rides
-    found, source = touched(many, qpos, "contact_force")
-    alone, _ = touched(lambda: make_engine(robot), qpos[:8, [0, 2]], "contact_force")
-    for lane, own in ((0, 0), (2, 1)):
-        rows = np.flatnonzero(source[:, lane] == 0)
-        assert found[0, lane] == pytest.approx(alone[0, own], rel=1e-9)
-        assert found[1 + rows[0], lane] == pytest.approx(alone[1, own], rel=1e-9)
-    assert alone.min() > 1
-
-
 @pytest.mark.parametrize(
     ("sensor", "message"),
     [
@@ -441,42 +414,6 @@ def test_types_of_modules_bring_their_sensors(tmp_path):
     (tmp_path / "modules.yaml").write_text(FISHY.replace("type: gyro", "type: angle"))
     with pytest.raises(InputError, match=r"sensors.1: expected a kind that may sit on modules"):
         load_modules(tmp_path / "modules.yaml")
-
-
-@pytest.mark.slow
-def test_bodies_that_differ_have_the_sensors_of_their_modules(tmp_path):
-    """One body, alone and beside another one: the same score, to rounding."""
-    (tmp_path / "modules.yaml").write_text(FISHY)
-    (tmp_path / "paddle.yaml").write_text(PADDLE)
-    config = {
-        "morphology": str(tmp_path / "paddle.yaml"),
-        "modules": str(tmp_path / "modules.yaml"),
-        "world": {"name": "lake", "current": [0.1, 0, 0]},
-        "controller": {"type": "mlp", "hidden": 2, "messages": 0, "sensors": [
-            {"type": "accelerometer", "each": "FixedBrick"}, "angle"]},
-        "task": {"type": "directed_swim", "duration": 0.5, "settle": 0.0, "trials": 1},
-    }  # fmt: skip
-    modules = MODULES | load_modules(tmp_path / "modules.yaml")
-    examples = [make_morphology(yaml.safe_load(text), modules) for text in (PADDLE, OAR)]
-    settings = make_config(config, source="run.yaml")
-    mixed = make_mixed_fitness(settings, examples)
-    single = fit_body(settings, examples[0])
-    assert single.num_genes == mixed.num_genes
-    assert "FixedBrick flow x>h1" in single.controller.gene_names
-    genes = np.random.default_rng(0).normal(size=(2, mixed.num_genes)).astype(np.float32)
-    key = jax.random.key(0)
-    together = mixed([mixed.build(own) for own in examples], genes, key)
-    alone = single(genes[:1], key)
-    # Single precision, and hinges that meet their stops; in double, what is felt is the same.
-    assert together[0] == pytest.approx(float(alone[0]), abs=2e-4)
-    # The senses matter: with their weights at 0, it swims otherwise.
-    deaf = genes[:1].copy()
-    deaf[:, [k for k, n in enumerate(single.controller.gene_names) if "FixedBrick" in n]] = 0
-    assert abs(float(single(deaf, key)[0]) - float(alone[0])) > 2e-3
-    # A module's id is one body's alone.
-    named = config | {"controller": {"type": "mlp", "sensors": [{"type": "flow", "at": "hand"}]}}
-    with pytest.raises(InputError, match="expected `each` a type of modules in place of `at`"):
-        make_mixed_fitness(make_config(named, source="run.yaml"), examples)
 
 
 PADDLE = """

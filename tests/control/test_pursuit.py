@@ -70,13 +70,6 @@ def test_the_curve_of_pursuit():
     assert caught == pytest.approx(expected, abs=0.03)
 
 
-def test_who_is_as_fast_is_never_caught():
-    """Half the distance stays: in Bouguer's curve of equal speeds, away tends to D / 2."""
-    way = chase(lambda t: (0.0 * t, 0.5 * t, 0.0), (-2.0, 0, 0), 0.5, 100.0, 30.0)
-    prey = 0.5 * DT * (len(way) - 1)
-    assert np.linalg.norm(way[-1] - [0, prey, 0]) == pytest.approx(1.0, abs=0.01)
-
-
 def test_a_pursuer_travels_with_what_is_remembered():
     """From the cues to the core's frame; nothing of it where nobody pursues."""
     tank = world()

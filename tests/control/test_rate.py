@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from laboratory import elbow_robot, world
-from mjx_revolve.control.cpg import make_cpg
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.plant import plant_of
@@ -103,13 +102,6 @@ def test_a_cpgs_frequency_depends_neither_on_the_rate_nor_on_the_step(plant):
             for number in (1, 77, 199):
                 x = (expm(matrix * number / 10) @ [0, 0, 1, 1])[:2]
                 assert found[number, :, lane] == pytest.approx(np.pi / 4 * np.tanh(x), abs=1e-8)
-
-
-def test_without_a_rate_a_controller_acts_at_every_step(plant):
-    times = np.arange(0, 1, 0.005)
-    found = commands(plant, times, type="cpg", rate=None)
-    assert found == pytest.approx(commands(plant, times, make=make_cpg), abs=0)
-    assert (np.diff(found, axis=0) != 0).all()
 
 
 def test_older_runs_have_no_rate_and_keep_their_fingerprint(tmp_path):

@@ -22,7 +22,7 @@ from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.state import RootState
-from mjx_revolve.water.flow import Water, water_of
+from mjx_revolve.water.flow import water_of
 
 LANES = 3
 TANK = world(**WATER | {"current": (0.3, 0.0, 0.0), "bed": {"height": -9.0}})
@@ -230,13 +230,6 @@ def test_touch_is_the_beds_force_on_each_body(robot):
         bed, _ = jax.jit(push, compiler_options=QUICK)(jnp.asarray(qpos), jnp.asarray(qvel))
     # Nothing moves, so that no force has friction: all of them point up.
     assert found.touch.sum(0) == pytest.approx(np.asarray(bed[2]), rel=1e-9)
-
-
-@pytest.mark.slow
-def test_the_waters_surface_is_what_heights_are_measured_from(robot, states):
-    lifted = Water(1.5, TANK.current)
-    found, _ = senses(TANK, lambda: make_engine(robot), *states, water=lifted)
-    assert found.height == pytest.approx(states[0][2] - 1.5)
 
 
 def test_work_adds_up():

@@ -13,7 +13,7 @@ from mjx_revolve.body.morphology import load_morphology, make_morphology
 from mjx_revolve.body.sensors import SENSORS, Sensor, SensorRow
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.control.readings import SensorReadings
-from mjx_revolve.control.sensors import hash_normal, make_observer
+from mjx_revolve.control.sensors import make_observer
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.config import ControllerConfig
@@ -102,29 +102,6 @@ def test_noise_is_drawn_anew_for_each_sample_and_lane_and_stays_the_same():
     # With a rate, it is drawn with the sample.
     held = watch(Sensor(type="climb", noise=0.02, rate=10.0), still[:40, :2], seeds[:2])
     assert len(np.unique(held)) == 2 * 4
-
-
-def test_noise_belongs_to_the_hinge_not_to_its_row():
-    def noise(order):
-        number = np.array(order, np.int32)[:, None]
-        observer = make_observer([Sensor(type="angle", noise=0.1)], DT)
-        angle = jnp.zeros((3, 4))
-        sense = SensorReadings(0.0, 0.0, (), (), angle=angle, noise=jnp.arange(4, dtype=jnp.uint32))
-        return np.asarray(observer.observe((), jnp.array(0.5), sense, number)[1].joint[0])
-
-    assert np.array_equal(noise([2, 0, 1])[[1, 2, 0]], noise([0, 1, 2]))
-    assert len(np.unique(noise([0, 1, 2]))) == 12
-
-
-def test_the_noise_is_normal():
-    """Kolmogorov and Smirnov's distance of 200,000 draws, and the tails."""
-    from scipy.stats import kstest
-
-    seeds = jnp.arange(200_000, dtype=jnp.uint32)
-    found = np.asarray(hash_normal(seeds, 3, 0, 17, jnp.float32))
-    assert kstest(found, "norm").statistic < 0.004
-    assert np.mean(np.abs(found) > 3) == pytest.approx(0.0027, rel=0.15)
-    assert np.isfinite(found).all()
 
 
 def test_a_sensor_of_bodies_speaks_of_core_and_hinges():

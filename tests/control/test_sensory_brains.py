@@ -15,7 +15,7 @@ from mjx_revolve.control.joint_network import make_joint_network
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.control.sensory_cpg import make_sensory_cpg
-from mjx_revolve.control.splines import make_splines, refine_splines
+from mjx_revolve.control.splines import make_splines
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.config import ControllerConfig
@@ -89,17 +89,6 @@ def test_zero_genes_keep_still_whatever_is_felt(kind, name):
 def test_genes_have_names_of_their_own_and_places(kind):
     controller = make(kind, plant_of(robot_of("spider")))
     assert len(set(controller.gene_names)) == controller.num_genes == len(set(controller.genes))
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_order_only_permutes_the_rows(kind):
-    robot = robot_of("spider")
-    plain, order = plant_of(robot), np.random.default_rng(1).permutation(8)
-    controller = make(kind, plain)
-    genes = drawn(controller)
-    straight = play(controller, plain, genes, 120, sense_of(8))
-    turned = play(controller, plant_of(robot, order), genes, 120, sense_of(8, order=order))
-    assert turned == pytest.approx(straight[:, order], abs=1e-9)
 
 
 @pytest.mark.slow
@@ -261,14 +250,3 @@ def test_a_splines_gait():
     assert found["mean_period"] == pytest.approx(1.0)
     assert found["mean_amplitude"] == pytest.approx(0.5 * REACH, rel=0.01)
     assert found["mean_phase_offset"] == pytest.approx(0.7, abs=0.01)
-
-
-def test_refined_splines_keep_their_shape():
-    robot = elbow_robot(world())
-    plant = plant_of(robot)
-    genes = drawn(make_splines(plant, 4), scale=0.4)
-    finer = refine_splines(genes[:, 0], 4, 12)[:, None]
-    old = play(make_splines(plant, 4), plant, genes, 300, sense_of(2))
-    new = play(make_splines(plant, 12), plant, finer, 300, sense_of(2))
-    # Every third point is an old one, and between them the two curves are of third order.
-    assert new == pytest.approx(old, abs=0.02)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from experiments.random_bodies import random_body
-from laboratory import ROOT, body, read, world
+from laboratory import ROOT, read
 from mjx_revolve import build_robot, load_morphology, load_world, make_mixed_fitness
 from mjx_revolve.body.morphology import trim_neutral
 from mjx_revolve.engine.assembly import assemble
@@ -20,7 +20,6 @@ from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.mujoco_model import compile_model
 from mjx_revolve.engine.plant import body_geometry
 from mjx_revolve.engine.step_constants import read_constants
-from mjx_revolve.inputs.errors import InputError
 
 # Fins, thrusters before and behind hinges, a point ballast, a plate that is its own body.
 ODD = """
@@ -200,9 +199,3 @@ def test_nothing_is_compiled_before_somebody_asks(monkeypatch):
     again = pickle.loads(pickle.dumps(robot))
     assert again.morphology == robot.morphology and again.world == robot.world
     assert np.array_equal(again.assembly.inertia, robot.assembly.inertia)
-
-
-def test_robots_of_two_worlds_do_not_stand_side_by_side():
-    one, other = build_robot(body("core"), world()), build_robot(body("core"), world(gravity=3.7))
-    with pytest.raises(InputError, match="robot 'core': expected the world of 'core'"):
-        pack_bodies([one, other], fit_capacity([one]))

@@ -324,17 +324,6 @@ def test_lanes_do_not_know_of_each_other(elbow):
     assert np.array_equal(rolled, q[..., turned])
 
 
-@pytest.mark.slow
-def test_a_population_against_one_at_a_time(elbow):
-    """The same up to rounding: another shape is another program."""
-    qpos, qvel, ctrl = drawn(elbow, 8)
-    _, together, _, _ = march(elbow, 0.5, qpos, qvel, ctrl)
-    for lane in (0, 7):
-        one = slice(lane, lane + 1)
-        _, alone, _, _ = march(elbow, 0.5, qpos[:, one], qvel[:, one], ctrl[:, one])
-        assert alone == pytest.approx(together[..., one], abs=1e-10)
-
-
 def test_the_water_may_differ_between_lanes():
     """Each lane's surface and current are its own."""
     robot = build_robot(body("core"), world(gravity=9.81, buoyancy="partial", drag="faces"))
@@ -373,26 +362,6 @@ def test_momentum_of_a_jointed_body_in_a_vacuum(arm):
         assert (states[1] - states[0]) / 2e-5 == pytest.approx(0.0, abs=1e-3)
 
 
-@pytest.mark.slow
-def test_a_mirrored_spider_swims_a_mirrored_way():
-    """The spider is its own mirror image in y = 0: front and back swapped, hips turned back."""
-    robot = build_robot(body("spider"), world(**WATER))
-    names = [robot.mj_model.actuator(k).name for k in range(robot.num_hinges)]
-    swap = {"front": "back", "back": "front", "left": "left", "right": "right"}
-    parts = [name.split("_") for name in names]
-    other = [names.index(f"{swap[side]}_{joint}") for side, joint in parts]
-    sign = np.array([-1.0 if joint == "hip" else 1.0 for _, joint in parts])[:, None]
-    qpos, qvel = at_rest(robot, 2, -0.5)
-    ctrl = np.random.default_rng(2).uniform(-0.6, 0.6, (8, 1))
-    ctrl = np.hstack([ctrl, (sign * ctrl)[other]])
-    _, q, _, _ = march(robot, 2.0, qpos, qvel, ctrl, every=10)
-    there, back = q[..., 0], q[..., 1]
-    assert np.abs(there[:, :3] - qpos[:3, 0]).max() > 0.01
-    mirrored = there[:, :7] * [1, -1, 1, 1, -1, 1, -1]
-    assert back[:, :7] == pytest.approx(mirrored, abs=1e-6)
-    assert back[:, 7:] == pytest.approx((there[:, 7:] * sign.T)[:, other], abs=1e-6)
-
-
 def check_order(make, steps):
     """The end of half a second: what changes when the step halves, halves too, or better.
 
@@ -413,12 +382,6 @@ def check_order(make, steps):
 @pytest.mark.slow
 def test_convergence_in_the_time_step():
     check_order(lambda tank: build_robot(body("core"), tank), (0.004, 0.002, 0.001))
-
-
-@pytest.mark.slow
-def test_convergence_of_a_jointed_body():
-    """From half a millisecond on: when a servo's torque leaves its limit is known to a step."""
-    check_order(elbow_robot, (0.0005, 0.00025, 0.000125))
 
 
 @pytest.mark.slow

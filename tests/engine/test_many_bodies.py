@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from experiments.random_bodies import random_body
-from laboratory import QUICK, ROOT, WATER, accelerate, body, march, random_states, read, world
+from laboratory import QUICK, ROOT, WATER, accelerate, body, random_states, read, world
 from mjx_revolve import MODULES, load_config, load_morphology, make_fitness, make_mixed_fitness
 from mjx_revolve.body.edits import add_module
 from mjx_revolve.control.controller import gene_indices
@@ -24,12 +24,11 @@ from mjx_revolve.engine.batch import (
     pack_bodies,
 )
 from mjx_revolve.engine.batched_trees import make_batched_trees
-from mjx_revolve.engine.population import PopulationEngine, acceleration
+from mjx_revolve.engine.population import acceleration
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.step_constants import read_constants
 from mjx_revolve.episodes.config import make_config
 from mjx_revolve.episodes.fitness import fit_body
-from mjx_revolve.episodes.rollout import Rollout, held
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.xla import fuse
 from mjx_revolve.water.flow import water_of
@@ -209,39 +208,6 @@ def test_room_for_all_bodies_of_so_many_modules():
         pack_bodies([build_robot(random_body(0, 8, 0), tank)], capacity)
 
 
-@pytest.mark.long
-def test_a_trajectory_is_that_of_the_body_alone():
-    """Lagged thrusters, carried water and all, through the compiled step that users run."""
-    robots, each = zoo("everything"), 2
-    capacity = fit_capacity(robots)
-    (qpos, qvel, ctrl), own = states(robots, capacity, each, 0.2)
-    tank = robots[0].world
-    with jax.enable_x64(True):
-
-        def run(bodies, qpos, qvel, ctrl):
-            rows = make_batched_trees(tank, capacity, bodies, qpos.shape[-1])
-            engine = PopulationEngine(rows, bodies.plant)
-            asked = engine.plant.arrange(ctrl)
-            rollout = Rollout(engine, held(asked), tank, water_of(tank))
-            record = lambda now, ctrl, water: (*engine.observe(now.state), now.energy)  # noqa: E731
-            return rollout.advance(rollout.init(engine.init(qpos, qvel)), record, 10, 10)[1]
-
-        jitted = jax.jit(run, compiler_options=QUICK)
-        start = [jnp.asarray(x) for x in (qpos, qvel, ctrl)]
-        mixed = jitted(pack(robots, capacity, each), *start)
-        alike = []
-        for k, robot in enumerate(robots):
-            here = slice(each * k, each * (k + 1))
-            alike.append(jitted(pack([robot], capacity, 1), *(x[:, here] for x in start)))
-    for k, (robot, (q0, v0, c0)) in list(enumerate(zip(robots, own, strict=True)))[1:]:
-        _, q1, v1, work1 = march(robot, 0.5, q0, v0, c0, every=10)  # auv and fish
-        here = slice(each * k, each * (k + 1))
-        for q, v, work in ([np.asarray(x)[..., here] for x in mixed], map(np.asarray, alike[k])):
-            assert q[:, : len(q0)] == pytest.approx(q1, abs=1e-7)
-            assert v[:, : len(v0)] == pytest.approx(v1, abs=1e-5)
-            assert work == pytest.approx(work1, abs=1e-8)
-
-
 @pytest.fixture(scope="module")
 def config():
     return load_config(
@@ -296,31 +262,6 @@ def test_scores_are_those_of_each_body_alone(config, fitness, tmp_path):
         lone = jnp.asarray(np.random.default_rng(seed).normal(size=swapped[:1].shape), "float32")
         beside = fitness([robots[1]] * 5, jnp.repeat(lone, 5, 0), key)
         assert np.asarray(fitness([robots[1]], lone, key))[0] == np.asarray(beside)[0]
-
-
-@pytest.mark.long
-def test_a_body_with_a_population_of_its_own(config, fitness):
-    """One body for all, or several with as many individuals each: as if they were side by side."""
-    robots = [fitness.build(random_body(3, 6)), fitness.build(body("snake"))]
-    key, genes = jax.random.key(4), jax.random.normal(jax.random.key(5), (2, 3, fitness.num_genes))
-    scores, measures = fitness.evaluate(robots, genes, key)
-    assert scores.shape == measures["speed_m_s"].shape == (2, 3)
-    pick = [robots[k] for k in (0, 0, 0, 1, 1, 1)]
-    mixed, more = fitness.evaluate(pick, genes.reshape(6, -1), key)
-    assert np.ravel(scores) == pytest.approx(np.asarray(mixed), abs=1e-5)
-    assert np.std(mixed) > 1e-3
-    for name, values in more.items():
-        assert np.ravel(measures[name]) == pytest.approx(np.asarray(values), abs=1e-4), name
-    # One program for any body, and bits that do not depend on who is beside.
-    alone, _ = fitness.evaluate(robots[1], genes[1], key)
-    compiled = fitness.program(genes, key).cache_size()
-    assert np.array_equal(alone, scores[1])
-    again = fitness(robots[0], genes[0].at[1:].set(0.0), key)
-    assert fitness.program(genes, key).cache_size() == compiled
-    assert again[0] == scores[0, 0] and again[1] != scores[0, 1]
-    # Tables as well as robots.
-    assert np.array_equal(fitness(fitness.pack(robots), genes, key), scores)
-    assert np.array_equal(fitness(fitness.pack(robots[1:]), genes[1], key), alone)
 
 
 OWN = """

@@ -118,18 +118,3 @@ def test_the_mirror_image_swims_the_mirror_image(name, axes, world):
     assert np.abs(ways[0, -1, :3] - qpos[:3]).max() > 0.05
     for way, mirror in zip(ways[1:], mirrors, strict=True):
         np.testing.assert_allclose(way, mirror.pose(ways[0]), atol=ROUNDING)
-
-
-def test_mirrored_limbs_keep_a_spider_in_its_plane():
-    """Left limbs beat as the right ones do: no sideways drift, no yaw, no roll."""
-    robot = load("spider")
-    mirror, draw = Mirror(robot, 0), np.random.default_rng(5)
-    time = robot.world.timestep * np.arange(200)
-    # Three gaits, as many lanes as above: they share a program.
-    ctrl = np.sin(2 * np.pi * time[:, None] + draw.uniform(-3, 3, (3, 1, robot.mj_model.nu)))
-    ctrl = (ctrl + mirror.hinges(ctrl)) / 2
-    start = np.repeat(robot.start_qpos()[None], 3, 0)
-    ways = swim(robot, start, np.zeros((3, robot.mj_model.nv)), ctrl)
-    assert np.abs(ways[..., 1:3] - start[0, 1:3]).max() > 0.01
-    # x, and the quaternion's y and z, which turn out of the plane.
-    assert np.abs(ways[..., [0, 5, 6]]).max() < ROUNDING

@@ -151,18 +151,6 @@ def test_gusts_move_a_heavy_body_less():
 
 
 @pytest.mark.slow
-def test_the_worlds_own_gusts_come_from_the_key():
-    """As `gust_path` draws them from the key that `simulate` is given."""
-    tank = world(added_mass=True, buoyancy="partial", gust={"std": 0.2, "time": 0.5})
-    robot = box_robot(CUBE, RHO * 1e-3, tank)
-    key = jax.random.key(4)
-    path = gust_path(tank.gust, jax.random.fold_in(key, 1), 100, tank.timestep, 1)[..., 0]
-    start = np.concatenate([path[0], np.zeros(3)])
-    found = simulate(robot, None, 0.5, qpos=robot.start_qpos(), qvel=start, key=key)
-    assert found.qvel[:, :3] == pytest.approx(np.asarray(path[1:]), abs=1e-5)
-
-
-@pytest.mark.slow
 def test_a_whole_rollout_does_not_know_how_fast_its_water_goes():
     """Galilei: in a uniform current, moving along with it, an arm strokes as in still water."""
     robot = arm_robot(world(**WATER))

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -179,25 +178,3 @@ def test_the_auv_surges_without_pitch_and_heaves_without_drift():
     assert np.abs(heave[:, :2]).max() < 1e-3
     # Yaw stays, as propellers of a pair turn against each other.
     assert np.abs(q[:, 6]).max() < 1e-3
-
-
-def tail_wave(t):
-    """A wave that runs down the tail, 1 Hz, growing towards the fin [rad]."""
-    phase = 2 * np.pi * t - np.arange(3)
-    return jnp.minimum(t, 1.0) * jnp.array([0.2, 0.4, 0.6]) * jnp.sin(phase)
-
-
-@pytest.mark.slow
-def test_the_fish_swims_ahead_and_halving_the_step_changes_little():
-    """By its tail alone, level and at its depth."""
-    ends = []
-    for dt in (0.005, 0.0025):
-        robot = build_robot(body("fish"), world(**WATER, timestep=dt))
-        found = simulate(robot, tail_wave, 6.0, qpos=robot.start_qpos(2.0))
-        assert np.all(np.isfinite(found.qpos))
-        ends.append(np.asarray(found.qpos[-1]))
-        assert found.qpos[-1, 1] > 0.07
-        up = 1 - 2 * (found.qpos[:, 4] ** 2 + found.qpos[:, 5] ** 2)
-        assert up.min() > 0.95
-        assert np.abs(found.qpos[:, 2] + 2.0).max() < 0.05
-    assert np.linalg.norm(ends[1][:3] - ends[0][:3]) < 0.02 * ends[0][1]

@@ -7,7 +7,7 @@ import pytest
 from laboratory import ROOT
 from mjx_revolve.control.table import CONTROLLERS
 from mjx_revolve.episodes import config, tasks
-from mjx_revolve.episodes.config import dump_config, load_config, make_config, override_config
+from mjx_revolve.episodes.config import dump_config, load_config, override_config
 from mjx_revolve.inputs.errors import InputError
 
 CONFIGS = ROOT / "configs"
@@ -115,16 +115,6 @@ def test_the_kinds_are_those_there_are():
     assert own <= config.ControllerConfig.model_fields.keys()
 
 
-def test_several_problems_are_one_line(folder):
-    check_message(
-        "--set task.duration: expected a number > 0 and <= 86400 [s]; found -1 (and 2 more: "
-        "task.trials, evolution.seed)",
-        lambda: load_config(
-            folder / "good.yaml", ["task.duration=-1", "task.trials=0", "evolution.seed=-1"]
-        ),
-    )
-
-
 def test_settings_are_yaml(folder):
     settings = [
         "task.duration=20",
@@ -198,18 +188,6 @@ def test_own_functions_are_found_from_where_they_are_named(folder):
     assert "type: mine.py:stay" in inside and "type: elsewhere/mine.py:wave" in inside
     (folder / "inside.yaml").write_text(inside)
     assert load_config(folder / "inside.yaml").model_dump() == config.model_dump()
-
-
-def test_made_in_code(folder):
-    data = {"morphology": "robot.yaml", "world": "lake", "task": {"type": "speed"}}
-    assert make_config(data, folder).morphology == str(folder / "robot.yaml")
-    assert data["morphology"] == "robot.yaml"
-    check_message("config: expected a mapping; found 3", lambda: make_config(3))
-
-
-@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.name)
-def test_our_own_files_load(path):
-    assert load_config(path).world_name
 
 
 def test_older_run_folders_keep_the_values_of_their_worlds(tmp_path):

@@ -136,13 +136,6 @@ def test_a_core_that_leans(axis):
     assert found["turn_rate_rad_s"] == pytest.approx(0.0, abs=1e-5)
 
 
-def test_a_roll_is_no_turn():
-    """Twice round its own long axis, which lies level: its x axis points ahead and back again."""
-    half = 2 * np.pi * np.arange(90) / 89
-    quat = np.stack([np.cos(half), 0 * half, np.sin(half), 0 * half], 1)
-    assert read(still(quat=quat), "turn_rate_rad_s")["turn_rate_rad_s"] == pytest.approx(0.0)
-
-
 def test_a_jump():
     """In the air for 30 of 90 rows; on the bed it weighs 0.5 N, and lands on it with 5 N."""
     force = np.zeros((90, 3))
@@ -165,15 +158,6 @@ def test_a_wave_along_the_joints(frequency):
     assert found["joint_amplitude_rad"] == pytest.approx(0.4, rel=0.02)
 
 
-def test_phases_count_by_their_amplitudes():
-    """Of two a quarter of a turn apart, one thrice as wide: R = √(3² + 1²) / 4."""
-    found = read(still(angle=swing(1.3, (0, np.pi / 2), (0.6, 0.2))), *GAIT)
-    spread = math.sqrt(-2 * math.log(math.sqrt(10) / 4))
-    assert found["gait_phase_spread_rad"] == pytest.approx(spread, rel=1e-3)
-    assert found["gait_phase_lag_rad"] == pytest.approx(np.pi / 2, rel=1e-3)
-    assert found["joint_amplitude_rad"] == pytest.approx(0.4, rel=0.01)
-
-
 def test_the_stronger_of_two_frequencies_is_the_gaits():
     found = read(still(angle=swing(1.3) + 0.6 * swing(2.6) + 0.3), *GAIT)
     assert found["gait_frequency_hz"] == pytest.approx(1.3, abs=5e-3)
@@ -194,13 +178,6 @@ def test_what_is_no_gait_has_no_frequency(angle):
     found = read(still(angle=angle), *GAIT)
     assert [found[name] for name in GAIT[:3]] == [0.0, 0.0, 0.0]
     assert 0 <= found["joint_amplitude_rad"] < 1
-
-
-def test_hinges_that_a_robot_lacks_change_nothing():
-    """As in a batch of different bodies: rows of zeros behind the robot's own."""
-    alone = still(angle=swing(1.3, (0.0, 0.7, 1.1), (0.2, 0.4, 0.3)))
-    rows = replace(alone, angle=jnp.pad(alone.angle, ((0, 0), (0, 4), (0, 0))))
-    assert read(rows, *GAIT) == pytest.approx(read(alone, *GAIT), rel=1e-4)
 
 
 def test_measures_leave_the_scores_gradient_whole():

@@ -24,7 +24,6 @@ from mjx_revolve.body.morphology import trim_neutral
 from mjx_revolve.control.controller import bind_genes
 from mjx_revolve.control.cpg import make_cpg
 from mjx_revolve.control.feedback import make_feedback
-from mjx_revolve.control.sine import make_sine
 from mjx_revolve.engine.kinematics import body_poses
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import build_robot
@@ -121,16 +120,6 @@ def test_all_forms_of_joint_targets(elbow, still):
     # The function sees the time at the start of each step.
     clock = simulate(elbow, lambda t: jnp.array([t, 0.0]), SPAN)
     assert clock.ctrl[:, 0] == pytest.approx(DT * np.arange(STEPS), abs=1e-7)
-
-
-@pytest.mark.slow
-def test_a_controller_in_a_vacuum_and_for_one_step(arm):
-    """The shortest programs: nothing of them may be left that XLA:CPU aborts over."""
-    controller = make_sine(arm)
-    genes = np.full(controller.num_genes, 0.3)
-    for steps in (1, 3):
-        trajectory = simulate(arm, bind_genes(controller, genes), steps * DT)
-        assert trajectory.qpos.shape[0] == steps and np.all(np.isfinite(trajectory.qpos))
 
 
 @pytest.mark.slow
@@ -287,17 +276,6 @@ def test_gradient_through_a_rollout_of_a_jointed_body():
             ahead, behind = (float(value(build(flat + s * step))) for s in (1, -1))
             # Differences over 2 µ leave 1e-10 of the value, and what bends within them.
             assert found[k] == pytest.approx((ahead - behind) / 2e-6, rel=1e-4, abs=1e-6)
-
-
-@pytest.mark.slow
-def test_vmap_over_simulate(core):
-    """A batch by JAX's own hand is what single calls give."""
-    heights = jnp.array([-1.0, -0.01, 0.2])
-    start = jnp.asarray(core.qpos0)
-    run = lambda z: simulate(core, None, SPAN, qpos=start.at[2].set(z)).qpos  # noqa: E731
-    batch = jax.jit(jax.vmap(run), compiler_options=QUICK)(heights)
-    for z, found in zip(heights, batch, strict=True):
-        assert np.asarray(found) == pytest.approx(np.asarray(run(z)), abs=1e-5)
 
 
 @pytest.mark.slow

@@ -76,12 +76,6 @@ def test_escape_counts_the_nearest_and_how_late(robot, pursuer, score):
     assert judge("escape", given) == pytest.approx(score, abs=1e-6)
 
 
-def test_to_dive_is_no_escape():
-    given = track(along_x(0, 0, z=-1.0), target=along_x(9, 9))
-    assert judge("escape", given, depth_tolerance=0.4) == 0.0
-    assert judge("escape", given, depth_tolerance=1.1) == pytest.approx(1.0)
-
-
 def test_a_course_is_followed_from_row_to_row():
     """1 m along x, 2 m along y; the course is x in the first two rows, then y."""
     way, course = [[0, 0, 0], [1, 0, 0], [1, 2, 0], [1, 4, 0]], [[1, 0, 0]] * 2 + [[0, 1, 0]] * 2

@@ -222,14 +222,6 @@ def test_a_seed_says_everything(env, episode):
 
 
 @pytest.mark.slow
-def test_an_environment_does_not_depend_on_those_beside_it(config, env, episode):
-    many = make_vector_env(config, 70, sensors=SENSORS)
-    found = run(many, strokes(STEPS + 3, 70), seed=3)
-    for a, b in zip(episode[:4], found[:4], strict=True):
-        assert np.array_equal(a, b[:, :NUM])
-
-
-@pytest.mark.slow
 def test_what_is_over_begins_anew_at_the_next_step(env, fitness, episode):
     seen, rewards, _, over, _ = episode
     assert np.all(rewards[STEPS + 1] == 0) and not over[STEPS + 1].any()

@@ -197,14 +197,3 @@ def test_ribs_opens_an_archive_with_the_same_cells(make):
     assert len(to_ribs(make(), [])) == 0
     with pytest.raises(ValueError, match=r"expected \d+ solutions"):
         to_ribs(archive, solutions[1:])
-
-
-def test_ribs_and_we_round_alike_at_borders():
-    pytest.importorskip("ribs", reason=NO_RIBS)
-    axes = {name: {"low": -0.3, "high": 0.7, "cells": 10} for name in "ab"}
-    archive = grid(**axes)
-    borders = np.linspace(-0.3, 0.7, 11)
-    points = np.stack(np.meshgrid(borders, borders), axis=-1).reshape(-1, 2)
-    archive = insert(archive, np.arange(121), np.arange(121.0), points)
-    found = to_ribs(archive, filled(archive).tolist())
-    assert (found.data("index") == found.data("solution").astype(int)).all()

@@ -131,18 +131,6 @@ def test_a_copy_does_as_its_original():
     assert child["u fin_2"] == -1 and child["u fin"] == parent["u fin"]
 
 
-def test_a_limb_where_there_was_none():
-    """With nobody to learn from, genes are drawn."""
-    brains = joints(std_init=0.5, mutation=0.0)
-    bare = body("core")
-    one = add_module(bare, 0, 0, "ActiveHinge", name="first")
-    layout = layout_of(one, common=common())
-    child = brains.inherit(np.random.default_rng(0), [{"frequency": 0.7}], layout)
-    assert child["frequency"] == np.float32(0.7)
-    drawn = [child[name] for name in layout.names if name != "frequency"]
-    assert len(drawn) == 3 and all(drawn)
-
-
 def test_the_network_by_hand():
     """With one weight from x to the first kind of gene, those genes are x in units of .1 m."""
     brains, layout = make_brain_encoding(BrainsConfig(type="cppn"), common()), layout_of(SNAKE)
@@ -166,16 +154,6 @@ def test_the_network_by_hand():
     for gene, place, value in zip(layout.genes, layout.place, genes, strict=True):
         expected = np.sin(30 * place[1]) if gene.what == "u" else 0.0
         np.testing.assert_allclose(value, expected, rtol=1e-5, atol=1e-7)
-
-
-def test_network_children():
-    """Each weight comes of one of the parents."""
-    brains = make_brain_encoding(BrainsConfig(type="cppn", mutation=0.0), common())
-    ones, twos = [1.0] * brains.size, [2.0] * brains.size
-    child = brains.inherit(np.random.default_rng(0), [ones, twos], layout_of(SNAKE))
-    share = child.count(1.0) / brains.size
-    assert set(child) == {1.0, 2.0} and 0.3 < share < 0.7
-    assert brains.inherit(np.random.default_rng(0), [ones], layout_of(SNAKE)) == ones
 
 
 @pytest.mark.parametrize(("kind", "brain"), [("joints", [1.0]), ("joints", {"a": "b"}),

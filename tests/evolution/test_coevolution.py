@@ -335,14 +335,6 @@ def test_what_is_in_a_run_folder(folder, capsys):
 
 
 @pytest.mark.slow
-def test_a_run_cannot_become_another(folder, no_pictures, capsys):
-    assert main("toy.yaml", "--out", "run", "--set", "evolution.generations=2") == 0
-    for name, value in (("bodies.max_modules", 9), ("bodies.selection.type", "steady")):
-        assert main("--resume", "run", "--set", f"{name}={value}") == 2
-        assert ".".join(name.split(".")[:2]) in capsys.readouterr().err
-
-
-@pytest.mark.slow
 def test_workers_change_nothing(folder, no_pictures):
     """The same bits from this process and from two others."""
     toys.write_bodies_config(folder / "toy.yaml", {"learning": {"population_size": 6}})

@@ -295,16 +295,6 @@ def test_what_cannot_be_a_colony_is_refused():
     assert "colony.arena.edge: expected" in wrong(colony={**colony, "arena": {"edge": "wall"}})
 
 
-def test_a_gusty_world_is_refused(config):
-    gust = {"std": 0.1, "time": 2.0}
-    data = {**SETTINGS, "world": {"name": "lake", "bed": False, "gust": gust}}
-    with (
-        pytest.raises(InputError, match="without gusts"),
-        make_executor(make_config(data, ROOT), workers=1) as executor,
-    ):
-        ColonyEvolution(executor.fitness.config, executor)
-
-
 def test_the_shipped_configuration():
     """What docs/colony.md says of it."""
     config = load_config(ROOT / "configs" / "lake_colony.yaml")

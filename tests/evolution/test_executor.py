@@ -156,13 +156,6 @@ def test_the_champion_does_not_depend_on_blocks(crowd):
     assert champions[0].origin == champions[1].origin
 
 
-def test_a_population_of_another_shape_leaves_the_pool_as_it_is(crowd):
-    _, executor = crowd
-    with pytest.raises(InputError, match=r"population: expected \[P, 5\]; found"):
-        executor.evaluate(np.zeros((3, 4)), jax.random.key(0))
-    assert len(executor(np.zeros((2, 5)), jax.random.key(0))) == 2
-
-
 def test_each_worker_has_a_core_of_its_own(crowd):
     _, executor = crowd
     if not hasattr(os, "sched_getaffinity"):
@@ -186,11 +179,6 @@ def test_workers_ignore_interrupts(crowd):
     before = workers_of(os.getpid())
     assert len(executor(np.zeros((12, 5)), jax.random.key(0))) == 12
     assert workers_of(os.getpid()) == before
-
-
-def test_functions_without_a_name_cannot_have_workers(tmp_path):
-    with pytest.raises(ValueError, match="expected a function that can be imported; found"):
-        make_executor(toy_config(tmp_path), 2, lambda config: toys.Toy())
 
 
 def test_a_job_takes_all_files_along(tmp_path):

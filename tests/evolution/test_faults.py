@@ -100,29 +100,6 @@ def test_a_full_and_a_read_only_disk(folder):
     assert "Traceback" not in done.stderr
 
 
-def test_a_folder_that_is_removed(folder, capsys):
-    assert run_main("toy.yaml", "--out", "run", at=4, do=lambda: shutil.rmtree("run")) == 1
-    err = capsys.readouterr().err
-    assert err == f"error: {folder / 'run' / 'metrics.csv'}: No such file or directory\n"
-
-
-@pytest.mark.slow
-def test_a_second_run_in_one_folder_is_refused(folder, capsys):
-    codes = []
-
-    def begin_more():
-        codes.append(run_main("--resume", "run"))
-        codes.append(run_main("toy.yaml", "--out", "run"))
-
-    assert run_main("toy.yaml", "--out", "run", at=2, do=begin_more) == 0
-    assert codes == [2, 2]
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-    assert "run: expected a run that has stopped; found it running" in lines[0]
-    assert "run: expected a new or empty folder; found files" in lines[1]
-    assert run_main("toy.yaml", "--out", "alone") == 0
-    assert genes("run") == genes("alone")
-
-
 def test_a_population_beyond_the_memory_is_refused_beforehand(folder, capsys):
     huge = "evolution.population_size=1000000000000"
     for more in ((), ("--set", "evolution.strategy=DifferentialEvolution")):

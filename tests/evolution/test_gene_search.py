@@ -88,16 +88,6 @@ def test_all_failed_and_penalties():
     assert losses_from_scores(np.array([-1e4, np.nan]), -100.0)[1] > 1e4
 
 
-@pytest.mark.parametrize("value", [0.0, 1e-20, 1.0, -3e8])
-def test_ties_are_broken_by_almost_nothing_even_for_xla(value):
-    losses = losses_from_scores(np.full(64, value, np.float32))
-    assert np.all(np.diff(jnp.asarray(losses)) > 0)
-    # XLA flushes denormals to zero: the ranks that evosax takes must be different there, too.
-    ranks = jax.jit(lambda x: jax.scipy.stats.rankdata(x))(losses)
-    assert np.asarray(ranks).tolist() == list(range(1, 65))
-    assert abs(losses[-1] - losses[0]) <= 64 * max(np.spacing(np.float32(abs(value))), 1e-30)
-
-
 QUICK = ("CMA_ES", "OpenES", "SNES", "PGPE")
 
 
@@ -125,13 +115,6 @@ def check_optimum(name, within=0.05):
     assert -search.elite_scores[0] < within * start
     assert rows[-1]["champion"] == max(row["best"] for row in rows)
     assert np.allclose(search.elites[0], fitness.target, atol=2 * np.sqrt(within * start))
-
-
-def test_names_are_found_however_written():
-    assert find_strategy("cma-es") == "CMA_ES"
-    assert find_strategy("OpenES") == "Open_ES"
-    assert find_strategy("sep cma es") == "Sep_CMA_ES"
-    assert find_strategy("DE") == "DifferentialEvolution"
 
 
 @pytest.mark.parametrize(
@@ -224,13 +207,6 @@ def test_a_search_where_everything_fails_goes_on(value):
     assert rows[-1]["step_size"] > 0.05
 
 
-def test_a_fitness_may_name_its_worst_score():
-    fitness = Broken(lambda rows: rows == 2, -1000.0)
-    fitness.worst_score = -1000.0
-    _, rows = finish(settings(generations=2), fitness)
-    assert all(row["failed"] == 1 and row["mean"] > -50 for row in rows)
-
-
 def test_ties_do_not_shrink_the_step():
     # evosax alone: 0.5 to 8e-8 in 60 generations.
     class Flat(Quadratic):
@@ -308,12 +284,3 @@ def test_doing_nothing_is_a_candidate():
     # Of equal ones, what has evolved wins.
     champion = choose_champion(config, Broken(lambda rows: rows >= 0, 1.0), search)
     assert champion.origin.startswith("best of generation")
-
-
-def test_candidates_that_fail_do_not_win():
-    config = settings(generations=5)
-    search, _ = finish(config, Quadratic())
-    champion = choose_champion(config, Broken(lambda rows: rows != 2), search)
-    assert champion.origin == f"best of generation {search.elite_generations[2]}"
-    failed = choose_champion(config, Broken(lambda rows: rows >= 0), search)
-    assert failed.score == FAILED_SCORE

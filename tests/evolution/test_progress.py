@@ -79,15 +79,6 @@ def test_plain_lines_tell_the_time_left(clock):
     ]
 
 
-def test_a_colonys_line_tells_of_intervals(clock):
-    out = io.StringIO()
-    shown = progress.Progress(0, 6, out, "interval")
-    shown.show(row(1, living=14, time=10.0, times_real_time=35.2))
-    assert out.getvalue().splitlines()[1] == (
-        "interval 1/6  alive 14  time 10 s  best 0.25  mean 0.3333  times real time 35.2  left ?"
-    )
-
-
 LINES = {  # columns: what stands there, bar aside; nothing is cut in the middle
     20: ["3/4", "left 00:02"],
     40: ["3/4", "best 0.25", "left 00:02"],
@@ -118,19 +109,6 @@ def test_the_live_line_fits_its_terminal(columns, clock, monkeypatch):
     assert re.split("  +", found) == LINES[size.columns]
     # Figures keep their places.
     assert [line.rfind("left") for line in out.drawn[2:4]] == [out.drawn[3].rfind("left")] * 2
-
-
-def test_the_live_line_is_not_drawn_too_often(clock, monkeypatch):
-    monkeypatch.setattr(progress.Progress, "_columns", lambda self: 120)
-    out = Terminal("ascii")
-    shown = progress.Progress(0, 1000, out)
-    for generation in range(1, 101):
-        clock[0] += 0.01
-        shown.show(row(generation))
-    assert len(out.drawn) < 15
-    shown.close()  # interrupted: the last generation is there
-    assert out.drawn[-1].startswith("generation 100/1000   ###")
-    out.getvalue().encode("ascii")
 
 
 def test_dumb_terminals_get_plain_lines(clock, monkeypatch):

@@ -6,7 +6,6 @@ import io
 import json
 import os
 import shutil
-import zlib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -25,9 +24,6 @@ from mjx_revolve.evolution.fingerprints import settings_hash
 from mjx_revolve.evolution.run import _prepare, check_unchanged
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.yaml_reader import load_yaml
-from mjx_revolve.numerics import runtime
-from mjx_revolve.view.motion_plots import plot_trajectory
-from mjx_revolve.view.plots import figure_png
 from mjx_revolve.water.world import load_world
 
 ARRAYS = {
@@ -197,27 +193,11 @@ def test_a_folder_whose_making_was_cut_short_is_a_new_one(tmp_path, run, config)
     again.close()
 
 
-def test_a_folder_that_was_removed_is_not_made_anew_in_parts(run):
-    shutil.rmtree(run.path)
-    for write in (lambda: run.save_checkpoint(1, ARRAYS, {}, 3), lambda: run.update_info(a=1)):
-        with pytest.raises(OSError, match="the run folder was removed"):
-            write()
-    assert not run.path.exists()
-
-
 def test_one_process_at_a_time(run):
     with pytest.raises(InputError, match="expected a run that has stopped; found it running"):
         runs.open_run_folder(run.path)
     run.close()
     runs.open_run_folder(run.path).close()
-
-
-def test_info_is_json(run):
-    run.update_info(seed=None, inputs=None, finished="now")
-    assert json.loads((run.path / "run.json").read_text()) == {"finished": "now"}
-    (run.path / "run.json").write_text("{")
-    with pytest.raises(InputError, match=r"run.json: expected JSON; found"):
-        _ = run.info
 
 
 def test_a_failed_write_leaves_the_old_file(run):
@@ -405,18 +385,6 @@ def test_champion_genes_come_back_bit_for_bit(run):
             load_genes(run.path)
 
 
-def test_half_written_cache_entries_are_removed_once(tmp_path):
-    whole = zlib.compress(os.urandom(1000))
-    entries = {"whole-cache": whole, "empty-cache": b"", "half-cache": whole[:500], "other": b""}
-    for name, data in entries.items():
-        (tmp_path / name).write_bytes(data)
-    assert runtime.remove_broken_entries(tmp_path) == ["empty-cache", "half-cache"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".checked", "other", "whole-cache"]
-    assert runtime.remove_broken_entries(tmp_path) == []
-    (tmp_path / "late-cache").write_bytes(whole[:500])
-    assert runtime.remove_broken_entries(tmp_path) == ["late-cache"]
-
-
 @pytest.mark.filterwarnings("ignore:Error reading persistent compilation cache")
 def test_a_damaged_cache_entry_costs_only_time(tmp_path):
     """Damaged behind our back, after entries were looked through."""
@@ -439,22 +407,3 @@ def test_a_damaged_cache_entry_costs_only_time(tmp_path):
         for name, value in before.items():
             jax.config.update(name, value)
         compilation_cache.reset_cache()
-
-
-def swim(depth, steps=200):
-    time = np.arange(steps) * 0.05
-    path = np.stack([0.1 * time, 0.05 * np.sin(time), -depth + 0 * time], axis=-1)
-    return SimpleNamespace(time=time, xpos=np.stack([0 * path, path], axis=1))
-
-
-def test_trajectory_plot():
-    figure = plot_trajectory(swim(depth=2.0), surface_height=0.0)
-    above, side, depth, speed, _ = figure.axes
-    assert (above.get_xlabel(), above.get_ylabel()) == ("x (m)", "y (m)")
-    assert (side.get_xlabel(), side.get_ylabel()) == ("x (m)", "z (m)")
-    assert above.get_aspect() == side.get_aspect() == 1.0
-    assert np.allclose(depth.lines[0].get_ydata(), 2.0)
-    # Over one second the wiggle and the edges hardly count: 0.1 m/s along x, up to 0.05 along y.
-    smooth = speed.lines[1].get_ydata()
-    assert smooth.min() >= 0.1 and smooth.max() < np.hypot(0.1, 0.05) + 1e-6
-    assert figure_png(figure).startswith(b"\x89PNG")

@@ -17,14 +17,14 @@ from scipy.spatial.transform import Rotation
 from exports import ODD
 from laboratory import compiled_quickly, read
 from mjx_revolve.control.controller import Controller
-from mjx_revolve.control.readings import SensorReadings, readings_at_rest
+from mjx_revolve.control.readings import readings_at_rest
 from mjx_revolve.control.sensors import count_samples
 from mjx_revolve.control.table import CONTROLLERS
 from mjx_revolve.engine.plant import actuators_of, plant_of
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.fitness import make_fitness
 from mjx_revolve.episodes.rollout import Rollout
-from mjx_revolve.formats.brain import READINGS, _list_readings, champion_brain, make_brain
+from mjx_revolve.formats.brain import _list_readings, champion_brain, make_brain
 from mjx_revolve.formats.brain_c import make_brain_c
 from mjx_revolve.formats.brain_program import find_view, split_runs
 from mjx_revolve.formats.brain_python import make_brain_python
@@ -206,11 +206,6 @@ def quick():
         yield
 
 
-def test_every_reading_has_a_unit_and_a_meaning():
-    plain = set(SensorReadings._fields) - {"noise", "modules", "present", "nearest"}
-    assert set(READINGS) == plain | {"nearest_toward", "nearest_tag"}
-
-
 def test_indices_as_views_and_runs():
     draw = np.random.default_rng(0)
     cases = [np.arange(3, 9), np.arange(0, 12, 3), np.repeat(np.arange(2, 5), 4),
@@ -337,25 +332,6 @@ def plain_brain():
         signals=("force", "load"),
     )  # fmt: skip
     return make_brain(robot, controller, np.zeros(0), 20.0)
-
-
-def test_a_state_of_many_arrays(spider):
-    """Lines of Python that are broken are still Python."""
-
-    def step(parameters, state, time, sense):
-        return [*state[1:], sense.angle + state[0]], jnp.tanh(sum(state))
-
-    begin = [jnp.full((8, 1), 1e-4 * k) for k in range(40)]
-    controller = Controller(0, (), lambda genes, plant: (), lambda parameters: begin, step)
-    brain = make_brain(spider, controller, np.zeros(0), 20.0)
-    given, state, expected = [{"angle": np.full(8, 0.1 * k)} for k in range(4)], [*begin], []
-    for row in given:
-        felt = readings_at_rest(plant_of(spider), 1, ())._replace(angle=row["angle"][:, None])
-        state, command = step((), state, 0.0, felt)
-        expected.append(command[:, 0])
-    found = run_python(make_brain_python(brain), brain, given)
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
-    assert np.ptp(found[:, 0]) > 0.1
 
 
 @needs_cc

@@ -1,7 +1,6 @@
 """The command that writes robots and rollouts for other programs."""
 
 import dataclasses
-import importlib.util
 
 import jax.numpy as jnp
 import mujoco
@@ -11,7 +10,6 @@ import pytest
 from exports import ODD, odd_episode
 from mjx_revolve.control.controller import Controller
 from mjx_revolve.episodes import champion as episodes
-from mjx_revolve.episodes import early_checks
 from mjx_revolve.export import main
 from mjx_revolve.formats.brain import make_brain
 from mjx_revolve.inputs.commands import run_command
@@ -83,14 +81,6 @@ def test_command_writes_only_what_is_named(quick, capsys):
     assert [path.name for path in quick.rglob("*.xml")] == ["a.xml"]
 
 
-def test_command_puts_a_champions_files_into_its_run(quick, capsys, monkeypatch, episode):
-    champion = dataclasses.replace(episode, folder=quick / "run", fitness=object())
-    monkeypatch.setattr(episodes, "load_episode", lambda *_: champion)
-    monkeypatch.setattr(early_checks, "check_episode_files", lambda _: None)
-    assert run(capsys, "run")[0] == 0
-    assert (quick / "run" / "export" / "robot.urdf").is_file()
-
-
 def test_command_writes_a_champions_controller(quick, capsys, monkeypatch, episode):
     code, _, err = run(capsys, "odd.yaml", "--controller", "a.py")
     assert code == 2 and err.startswith("error: --controller: expected a champion; found a morph")
@@ -108,18 +98,6 @@ def test_command_writes_a_champions_controller(quick, capsys, monkeypatch, episo
     assert b'#include "my_brain.h"' in first["my_brain.c"]
     assert run(capsys, "odd.yaml", "--controller", "my_brain.py")[0] == 0
     assert first == {name: (quick / name).read_bytes() for name in names}
-
-
-def test_command_without_rosbags(quick, capsys, monkeypatch):
-    real = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name, *a: None if name == "rosbags" else real(name, *a)
-    )
-    code, out, err = run(capsys, "odd.yaml", "--out", "here")
-    assert code == 0 and "rollout.mcap" not in out
-    assert "\nno bag: --mcap: expected the package rosbags; found none (pip install" in err
-    code, _, err = run(capsys, "odd.yaml", "--mcap", "a.mcap")
-    assert code == 2 and err.startswith("error: --mcap: expected the package rosbags")
 
 
 WRONG = [

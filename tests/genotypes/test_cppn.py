@@ -45,20 +45,6 @@ def test_a_cross_with_a_tail():
     assert [m.name for m in body.modules if m.slot == 1][:2] == ["ActiveHinge-1", "ActiveHinge-1-1"]
 
 
-def test_slots_are_asked_for_where_they_are():
-    """A brick scores 1 - 10 |x + 2 y + 3 z - 1 - depth|, all others 0."""
-    away = [(X, 9, 1.0), (Y, 9, 2.0), (Z, 9, 3.0), (ONE, 9, -1.0), (DEPTH, 9, -1.0)]
-    bricks = network(*away, (9, BRICK, -10.0), (ONE, BRICK, 1.0), nodes=[Node(9, "abs")])
-    # Depth 1: 2 at (0, 1) only. Depth 2: 3 of (0, 2), (1, 1), (-1, 1) at (1, 1), its right. Depth
-    # 3: 4 of (2, 1), (1, 2), (1, 0) at (2, 1), straight on; and so on to the right.
-    found = tree(grow(bricks, Space(MODULES, ("FixedBrick", "ActiveHinge"), "Core", 1, 5, 0, 4)))
-    assert found == [((1, 2, 1, 1)[:k], "FixedBrick", 0.0) for k in (1, 2, 3, 4)]
-    # With a quarter turn of all, the first one's right looks down and its left up: there and
-    # straight on it is -1, 5 and 4, and 3 nowhere.
-    turned = bricks._replace(links=(*bricks.links, Connection(ONE, TURN, 1.0)))
-    assert tree(grow(turned, SPACE)) == [((1,), "FixedBrick", 90.0)]
-
-
 def test_what_overlaps_is_left_out_and_bounds_are_kept():
     """Bricks everywhere: the nearest places first, no two at one place, as many as there may be."""
     everywhere = network((ONE, BRICK, 1.0))

@@ -10,7 +10,6 @@ from mjx_revolve.genotypes.genotype import Space
 from mjx_revolve.genotypes.kinds import find_genotype
 from mjx_revolve.genotypes.plasticoding import (
     Grammar,
-    PlasticodingSettings,
     draw_sentence,
     expand,
     make_alphabet,
@@ -72,40 +71,6 @@ def test_modules_are_mounted_and_moved_on_to():
     # A joint has one slot, whatever the side; sensors, fins and thrusters carry nothing.
     assert [path for path, *_ in tree(draw("C addl AJ1 addr B"))] == [(3,), (3, 1)]
     assert [path for path, *_ in tree(draw("C addl ST addr F addf T"))] == [(1,), (2,), (3,)]
-
-
-def test_the_turtle_moves_to_what_is_there():
-    # Back to the core, on to the brick at the left again, and a joint behind it.
-    assert [path for path, *_ in tree(draw("C addl B moveb movel addf AJ1"))] == [(3,), (3, 1)]
-    # Nothing at the right: it stays. Back from the core is nowhere.
-    assert [path for path, *_ in tree(draw("C addl B moveb mover moveb addf AJ1"))] == [(1,), (3,)]
-    # On a joint all ways lead on.
-    further = draw("C addf AJ1 addf B moveb moveb movef mover addl B")
-    assert [path for path, *_ in tree(further)] == [(1,), (1, 1), (1, 1, 3)]
-    # Not on to a sensor.
-    assert [path for path, *_ in tree(draw("C addf ST movef addl B"))] == [(1,), (3,)]
-
-
-def test_the_back_of_a_core_comes_last():
-    three = "C addf B moveb addr B moveb addl B moveb"
-    assert [path for path, *_ in tree(draw(three))] == [(1,), (2,), (3,)]
-    assert [path for path, *_ in tree(draw(f"{three} addr AJ1"))] == [(0,), (1,), (2,), (3,)]
-    # Before, a side that is taken is taken; and a fifth module has no place.
-    assert [path for path, *_ in tree(draw("C addf B moveb addf B"))] == [(1,)]
-    assert tree(draw(f"{three} addr ST addr ST"))[0] == ((0,), "TouchSensor", 0.0)
-    assert len(tree(draw(f"{three} addr ST addr ST addl ST"))) == 4
-
-
-def test_upright_and_level():
-    """Revolve's turns: 90 from level to upright, 270 back, 0 for more of the same."""
-    assert [turn for *_, turn in tree(draw("C addf AJ2 addf B addf AJ1"))] == [90.0, 270.0, 0.0]
-    assert [turn for *_, turn in tree(draw("C addf AJ2 addf AJ2 addf BV addf FV"))] == [
-        90.0, 0.0, 0.0, 0.0
-    ]  # fmt: skip
-    level = draw("C addf AJ2 addf AJ1")
-    # AJ1 bends about a level axis, AJ2 about the upright.
-    axes = [m.rotation @ m.kind.hinge.axis for m in level.modules[1:]]
-    assert abs(axes[0][2]) == pytest.approx(1.0) and abs(axes[1][2]) == pytest.approx(0.0)
 
 
 def test_what_overlaps_or_exceeds_is_left_out():
@@ -241,16 +206,3 @@ def test_damaged_grammars_are_refused(rules, message):
     with pytest.raises(InputError) as error:
         genotype.from_plain(plain | {"rules": changed})
     assert str(error.value).startswith(message)
-
-
-def test_settings():
-    with pytest.raises(InputError, match="expected a number > 0 among add, delete and swap"):
-        PlasticodingSettings(add=0, delete=0, swap=0)
-    with pytest.raises(InputError, match=r"bodies.params.iteration: .*did you mean iterations\?"):
-        find_genotype("plasticoding", SPACE, {"iteration": 1}, "a.yaml")
-    # A rule of many letters takes no more.
-    short = find_genotype(
-        "plasticoding", SPACE, {"add": 1, "delete": 0, "swap": 0, "max_rule": 3, "groups": 1}, "x"
-    )
-    genome = short.random(np.random.default_rng(0))
-    assert short.mutate(np.random.default_rng(1), genome) is genome

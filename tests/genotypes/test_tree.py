@@ -9,7 +9,6 @@ from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import load_morphology, make_morphology
 from mjx_revolve.genotypes.genotype import Space
 from mjx_revolve.genotypes.kinds import find_genotype
-from mjx_revolve.genotypes.tree import mirror_limb, opposite_slot
 
 SPACE = Space(MODULES, ("FixedBrick", "ActiveHinge", "Fin"), "Core", 1, 12, 0, 8)
 RATES = ("add", "delete", "prune", "duplicate", "mirror", "swap", "retype", "turn")
@@ -120,22 +119,6 @@ def test_a_limb_is_mirrored():
     assert sorted(points(body, "hip")) == sorted(
         points(ONE, "hip") + [[-x, y, z] for x, y, z in points(ONE, "hip")]
     )
-
-
-def test_opposite_slots():
-    core, brick, hinge = (MODULES[name] for name in ("Core", "FixedBrick", "ActiveHinge"))
-    assert [opposite_slot(core, slot) for slot in range(4)] == [1, 0, 3, 2]
-    assert [opposite_slot(brick, slot) for slot in (1, 2, 3)] == [None, 3, 2]
-    assert opposite_slot(hinge, 1) is None
-    # Twice mirrored is as it was, but for -90, which is 270.
-    image = mirror_limb(ONE, 2)
-    assert [(m.slot, m.orientation) for m in image.modules[2:]] == [
-        (2, 270.0), (1, 180.0), (3, 90.0), (1, 0.0)
-    ]  # fmt: skip
-    again = mirror_limb(image, 2)
-    assert [(m.slot, m.orientation % 360) for m in again.modules] == [
-        (m.slot, m.orientation % 360) for m in ONE.modules
-    ]
 
 
 def test_crossover_exchanges_subtrees():

@@ -39,19 +39,6 @@ def test_a_grid_has_all_combinations_by_names_that_folders_may_have():
     assert combine([], "lake_swim") == {"lake_swim": ()}
 
 
-def test_names_tell_cases_apart_whatever_they_are_made_of():
-    cases = combine(read_axes(["a.type=../x/b.yaml,../y/b.yaml,B.yaml", "b.type=1,2"]), "c")
-    assert len({name.casefold() for name in cases}) == 6
-    assert next(iter(cases)) == "a.type=b+b.type=1"
-    names = list(
-        combine(read_axes(["x=-1,../..,/etc/passwd,'" + 300 * "a" + "','<b>&amp;\n'"]), "")
-    )
-    assert names[:3] == ["x=-1", "x=.._..", "x=_etc_passwd"]
-    assert len(names[3]) == 80
-    assert names[4] == "x=_b_amp_"
-    assert not any({*name} & {*"/\\ <>&'\"\n"} or name[0] in ".-" for name in names)
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

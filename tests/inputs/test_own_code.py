@@ -18,7 +18,6 @@ from mjx_revolve.evolution.run import check_unchanged
 from mjx_revolve.inputs import user_code as own_code
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.report.data import read_run
-from mjx_revolve.view.report.groups import group_runs
 from mjx_revolve.view.report.repeat import repeat_commands
 
 OWN = '''
@@ -193,26 +192,6 @@ def test_a_run_keeps_the_code(folder):
     (folder / "mine" / "own.py").write_text(OWN + "\n")
     assert settings_hash(load_config("swim.yaml")) != before
     assert len(repeat_commands(record)) == 1
-
-
-def test_reports_group_runs_by_what_the_code_says(folder):
-    for name, text in (("a", OWN), ("b", OWN), ("c", OWN + "\n")):
-        (folder / "mine" / "own.py").write_text(text)
-        runs.create_run_folder(name, load_config("swim.yaml"))[0].close()
-    groups = group_runs([read_run(name) for name in "abc"])
-    assert [len(group.records) + len(group.copies) for group in groups] == [2, 1]
-    assert groups[0].task != groups[1].task
-
-
-def test_a_lost_file_is_told_and_the_rest_is_read(folder):
-    runs.create_run_folder("run", load_config("swim.yaml"))[0].close()
-    (folder / "run" / "inputs" / "own.py").unlink()
-    record = read_run("run")
-    assert record.config is None
-    assert any(
-        "controller.type: expected a file; found none at inputs/own.py" in problem.text
-        for problem in record.problems
-    )
 
 
 def test_only_the_same_code_goes_on_with_a_run(folder):

@@ -203,13 +203,6 @@ def test_names_move_no_cursor_and_write_no_markup(folder, capsys):
     assert not any(c in page for c in "\x1b\x07\u202e")
 
 
-def test_a_robots_name_leads_nowhere(tmp_path, monkeypatch):
-    inside = tmp_path / "here"
-    inside.mkdir()
-    monkeypatch.chdir(inside)
-    assert str(viewer._usual_path(None, "viewer", "../../out")) == "out.html"
-
-
 def test_messages_are_one_line_and_cut():
     long = "x" * 5000
     message = str(InputError(f"a.yaml: expected a name; found '{long} {long}'\nand\x1b[2J {long}"))

@@ -120,14 +120,6 @@ def test_chunks_are_all_of_one_shape():
     assert set(seen) == {(4,)}
 
 
-def test_a_materialized_value_is_stored_though_it_is_used_once():
-    x, y = jnp.ones(4), jnp.ones((8, 4))
-    plain = lambda x, y: jnp.tanh(x)[None] * y  # noqa: E731
-    marked = lambda x, y: materialize(jnp.tanh(x))[None] * y  # noqa: E731
-    assert (xla.Graph(plain, (x, y)).size, xla.Graph(marked, (x, y)).size) == (0, 1)
-    assert np.array_equal(xla.Graph(marked, (x, y))(x, y), plain(x, y))
-
-
 @pytest.mark.skipif(not on_cpu(), reason="the annotations are for CPUs")
 def test_a_function_is_fused_once_whatever_its_caller_does():
     """By itself it is fused, with its numbers as they are; within a fused function it is not."""

@@ -3,7 +3,6 @@
 import json
 import math
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,14 +10,11 @@ import pytest
 from mjx_revolve import replay, report, viewer
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import make_morphology
-from mjx_revolve.episodes.champion import champion_number, load_episode
-from mjx_revolve.episodes.individual_log import find_individuals, read_generations, read_individuals
+from mjx_revolve.episodes.individual_log import read_generations, read_individuals
 from mjx_revolve.inputs.commands import run_command
-from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.body_pictures import SIZE, draw_bodies, plot_best, plot_descriptors
+from mjx_revolve.view.body_pictures import SIZE, draw_bodies
 from mjx_revolve.view.population import (
     pick_ancestors,
-    pick_evenly,
     read_population,
     trace_lineage,
 )
@@ -148,42 +144,6 @@ def test_who_was_best_and_who_came_of_whom(run):
     assert pick_ancestors(population, 77, 3) == []
 
 
-def test_of_a_long_line_those_stay_who_gained_most(tmp_path):
-    scores = [0.0, 0.1, 0.15, 0.5, 0.4, 0.9, 0.91]
-    born = [(k, [k - 1] * (k > 0), k + 1, "mutation", s, 1) for k, s in enumerate(scores)]
-    run = make_run(tmp_path / "long", born=born, living={7: [6]})
-    population, _ = read_population(run)
-    family = trace_lineage(population, 6, most=4)
-    assert [(kin.life.number, kin.skipped) for kin in family] == [(0, 0), (3, 2), (5, 1), (6, 0)]
-    assert [life.number for life in pick_ancestors(population, 6, 3)] == [0, 2, 4, 6]
-    assert pick_evenly([1, 2, 3, 4, 5], 3) == [1, 3, 5]
-    assert pick_evenly([4], 3) == [4] and pick_evenly([], 3) == []
-
-
-def test_without_generations_the_new_born_stand_in(run):
-    (run / "generations.jsonl").unlink()
-    population, (problem,) = read_population(run)
-    assert population.living == {1: (0, 1, 2), 2: (3, 4), 3: (5,)}
-    assert problem.startswith("generations.jsonl names none")
-    (run / "generations.jsonl").write_text('{"generation":1,"living":[0,8,9]}\n')
-    assert read_population(run)[1] == ["individuals.jsonl lacks 2 of the living"]
-
-
-def test_numbers_are_checked(run, tmp_path):
-    assert [life.number for life in find_individuals(run, [4, 1])] == [4, 1]
-    with pytest.raises(InputError, match="expected individual 6; found those from 0 to 5"):
-        find_individuals(run, [1, 6])
-    with pytest.raises(InputError, match="individual 2: genes: expected 10; found none: every"):
-        load_episode(run, individual=2)
-    assert champion_number(run) == 5
-    (run / "config.yaml").write_text(
-        json.dumps(SETTINGS | {"bodies": None, "morphology": "m.yaml"})
-    )
-    (run / "m.yaml").write_text(json.dumps(body(1)))
-    with pytest.raises(InputError, match="expected a run in which bodies evolve"):
-        load_episode(run, individual=1)
-
-
 def test_pictures_have_one_scale_and_fit():
     small, large = (make_morphology(body(hinges), MODULES) for hinges in (1, 4))
     together = draw_bodies([small, large])
@@ -198,26 +158,6 @@ def test_pictures_have_one_scale_and_fit():
     alone = (draw_bodies([small])[0] < 250).any(axis=-1)
     assert alone.sum() > 1.2 * drawn[0].sum()
     assert draw_bodies([]) == []
-
-
-def test_a_sheet_of_the_best(run):
-    figure = plot_best(run, MODULES, "a $title")
-    texts = [text.get_text() for axes in figure.axes for text in axes.texts]
-    assert texts == ["5: 0.5", "4 modules, 3 hinges", "3: 0.3", "3 modules, 2 hinges",
-                     "4: 0.2", "2 modules, 1 hinge"]  # fmt: skip
-    figure.canvas.draw()  # a dollar is no formula
-
-
-def test_sizes_over_the_generations(run):
-    population, _ = read_population(run)
-    figure = plot_descriptors(population, ("speed_m_s",))
-    panels = {axes.get_title(loc="left"): axes for axes in figure.axes}
-    assert list(panels)[:3] == ["speed over ground (m/s)", "number of modules", "number of hinges"]
-    mean, best = panels["number of hinges"].lines
-    assert mean.get_xdata().tolist() == [1, 2, 3]
-    assert np.allclose(mean.get_ydata(), [2.0, 5 / 3, 2.0])
-    assert best.get_ydata().tolist() == [2.0, 2.0, 3.0]
-    assert plot_descriptors(read_population(Path("/nowhere"))[0]) is None
 
 
 @pytest.mark.slow
@@ -261,18 +201,6 @@ def test_cells_of_the_archive_are_links(tmp_path, still):
     assert "<?xml" not in page and page.count("<svg") == 1
 
 
-def test_whose_pages_are_asked_for(run, tmp_path):
-    record = read_run(run)
-    assert report_bodies.choose_individuals(record, [4, 1, 4]) == [4, 1]
-    assert report_bodies.choose_individuals(record, "best") == [5, 3, 4, 1]
-    with pytest.raises(InputError, match="expected individual 6; found none"):
-        report_bodies.choose_individuals(record, [6])
-    with pytest.raises(InputError, match="expected a run with an archive; found none"):
-        report_bodies.choose_individuals(record, "archive")
-    kept = read_run(make_run(tmp_path / "archive", ARCHIVE))
-    assert report_bodies.choose_individuals(kept, "archive") == [4, 3, 5]
-
-
 def test_pages_that_are_there_stay(run, monkeypatch):
     asked = []
 
@@ -311,14 +239,6 @@ def test_what_is_left_is_shown(run, still, damage, message):
     assert message in record.warning
     page = report_page.make_report([record])
     assert ("Body of individual" in page) == (run / "individuals.jsonl").is_file()
-
-
-def test_best_individual_stands_in_for_a_lost_champion(run):
-    (run / "champion/genes.yaml").unlink()
-    record = read_run(run)
-    assert record.stand_in == "best individual in individuals.jsonl, number 5"
-    assert record.individual == 5 and record.genes.shape == (10,)
-    assert report_page._champions_body(record, record.config).num_hinges == 3
 
 
 @pytest.mark.parametrize(

@@ -83,20 +83,6 @@ def test_what_is_said_to_be_missing_makes_it_neutral():
     assert weigh(made).displaced == pytest.approx(1e6 * trimmed.volume, rel=1e-3)
 
 
-def test_ballast_that_is_said_to_be_missing_makes_it_neutral():
-    light = "electronics_volume: 2.0e-4"
-    steel = said(r"such as (\S+) g of stainless steel", bench(f"{{{light}}}"))
-    ballast = f"ballast: {steel / 1e3}, ballast_volume: {steel / 1e3 / 7900}"
-    made = bench(f"{{{light}, {ballast}, ballast_position: [0, 0, -0.02]}}")
-    assert abs(weigh(made).missing) < 1e-3 * weigh(made).displaced
-    assert "it is neutral" in " ".join(ballast_words(weigh(made)))
-
-
-def test_a_world_without_water_says_nothing_on_ballast():
-    [only] = ballast_words(weigh(bench(density=0.0)))
-    assert "no water" in only
-
-
 def test_joints_move_as_the_table_says():
     robot = bench()
     model, data = robot.mj_model, mujoco.MjData(robot.mj_model)

@@ -5,19 +5,16 @@ import numpy as np
 import pytest
 
 from laboratory import (
-    WATER,
     accelerate,
     arm_robot,
-    body,
     box_robot,
     face_drag,
     random_states,
     world,
 )
 from mjx_revolve.body.module_types import Thruster
-from mjx_revolve.engine.robot import Robot, build_robot
+from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.simulate import Trajectory
-from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.forces import module_forces
 from mjx_revolve.water.flow import Water, flow, water_of
 from mjx_revolve.water.plates import LiftDrag
@@ -102,20 +99,6 @@ def test_thrust_follows_the_curve():
     assert asked.thrust[0, 0] == pytest.approx([0, 0.8 * 0.25, 0])
 
 
-def test_thrust_of_the_auv():
-    """Each thruster by its own curve, at its own module, along its own axis."""
-    robot = build_robot(body("auv"), world(**WATER))
-    command = np.array([[0.3, -0.6, 0.9, 0.4]])
-    forces = module_forces(robot, states(robot, robot.start_qpos(2.0), command=command))
-    for k, (row, part) in enumerate(zip(robot.thruster_row, robot.thruster_part, strict=True)):
-        size = part.thruster.thrust_at(command[0, k])
-        assert np.linalg.norm(forces.thrust[0, row]) == pytest.approx(abs(size), rel=1e-5)
-        axis = robot.fluid.rotation[row] @ part.thruster.axis
-        assert forces.thrust[0, row] == pytest.approx(size * axis, abs=1e-6)
-    others = np.setdiff1d(np.arange(len(robot.fluid.body)), robot.thruster_row)
-    assert not forces.thrust[0, others].any()
-
-
 def test_water_of_its_time():
     """Waves go on with time, a current's rows with the steps: drag sees the water of the moment."""
     sea = world(drag="faces", gravity=G, waves=[{"amplitude": 0.05, "wavelength": 2.0}])
@@ -194,16 +177,3 @@ def test_sum_is_what_the_step_does(laws):
         for q, v, a in zip(qpos.T, qvel.T, acceleration.T, strict=True)
     ]
     assert total == pytest.approx(np.array(expected), rel=1e-3, abs=2e-4)
-
-
-@pytest.mark.parametrize("every", [0, 1.5])
-def test_every_is_checked(every):
-    robot = box_robot(BRICK, 0.03, world())
-    with pytest.raises(InputError, match=r"^every: expected a whole number of at least 1; found"):
-        module_forces(robot, states(robot, pose()), every)
-
-
-def test_another_robots_trajectory():
-    robot, other = box_robot(BRICK, 0.03, world()), arm_robot(world())
-    with pytest.raises(InputError, match=r"^trajectory.qpos: expected \[1, 7\]; found \[1, 11\]$"):
-        module_forces(robot, states(other, other.qpos0))

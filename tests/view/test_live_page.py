@@ -17,11 +17,9 @@ from browser import Browser, needs_browser
 from laboratory import body
 from mjx_revolve import live
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.episodes.fitness import make_mixed_fitness
-from mjx_revolve.episodes.tank import make_tank
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.live.commands import Current, Drop, Pause, Rate, Remove, Reset, read_command
+from mjx_revolve.view.live.commands import Current, Drop, Pause, Rate, read_command
 from mjx_revolve.view.live.page import live_page
 from mjx_revolve.view.live.robot_catalogue import load_catalogue
 from mjx_revolve.view.live.server import LiveServer
@@ -120,45 +118,6 @@ def test_time_stops_and_goes_on(entries):
         running.ask(Pause(False))
         assert running.hear("poses", lambda data: data["t"][0] > stopped)
         assert running.hear("state", lambda data: not data["paused"])["rate"] == 4
-
-
-def test_nothing_moves_while_nobody_looks(entries):
-    running = Running(entries)
-    with running:
-        running.hear("poses")
-        running.simulation.leave(running.listener)
-        running.ask(Rate(1.0))  # the slice that was under way is over
-        before = running.tank.time
-        running.ask(Rate(1.0))
-        assert running.tank.time <= before + 0.11
-        other = running.simulation.listen()
-        names = [read_event(other.get(timeout=PATIENCE))[0] for _ in range(4)]
-        assert names == ["state", "bodies", "cast", "poses"]  # what there is comes first
-
-
-def test_robots_find_room_beside_others(entries):
-    with Running(entries, first=()) as running:
-        running.ask(Pause(True))
-        keys = [running.ask(Drop(who)) for who in (0, 1, 2)]
-        assert keys == [0, 1, 2]
-        places = np.array([running.simulation.qpos[key][:2] for key in keys])
-        apart = np.linalg.norm(places[:, None] - places, axis=-1)[np.triu_indices(3, 1)]
-        lengths = [entries[who].robot.morphology.length for who in (0, 1, 2)]
-        least = 0.6 * (min(lengths) * 2)
-        assert apart.min() >= least - 1e-9 and apart.max() < 3 * sum(lengths)
-        running.ask(Drop(0, (20.0, 0.0), 3.0))
-        with pytest.raises(InputError, match=r"tank: expected a free place; found all 4 taken"):
-            running.ask(Drop(0))
-        running.ask(Remove(1))
-        assert [one.key for one in running.simulation.robots] == [0, 2, 3]
-        with pytest.raises(InputError, match=r"remove\.key: expected a robot's; found 1"):
-            running.ask(Remove(1))
-        with pytest.raises(InputError, match=r"drop\.entry: expected a number below 3; found 3"):
-            running.ask(Drop(3))
-        running.ask(Current((0.1, 0, 0)))
-        running.ask(Reset())
-        assert (running.simulation.robots, running.simulation.current) == ((), (0, 0, 0))
-        assert not running.simulation.paused
 
 
 def test_who_blows_up_is_taken_out(entries):
@@ -421,15 +380,6 @@ def test_mistakes_end_in_one_line(monkeypatch, capsys, argv, said):
     assert error.startswith(f"error: {said}") and error.count("\n") == 1
 
 
-def test_a_port_that_is_taken(catalogue, served, monkeypatch, capsys):
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
-    known = "mjx_revolve.view.live.robot_catalogue.load_catalogue"
-    monkeypatch.setattr(known, lambda *_: catalogue)
-    port = str(served.server_address[1])
-    assert run_command(live.main, ["snake", "--port", port]) == 1
-    assert f"port {port}: " in capsys.readouterr().err
-
-
 def test_the_scene_has_everybody_where_they_are(entries):
     """One model of all: bodies where each robot's own model has them."""
     with Running(entries, first=(Drop(0), Drop(1, (3.0, 0.0)))) as running:
@@ -481,34 +431,6 @@ def test_keys_of_the_window(entries):
         assert "tank: expected a free place" in hands.words()[1]
         press(268)
         assert len(simulation.robots) == 1 and not simulation.paused
-
-
-@pytest.mark.slow
-def test_a_true_tank(monkeypatch):
-    """A neutral snake that keeps still goes with the water, once that has taken it along."""
-    config = {"morphology": "snake", "world": "empty_underwater", "trim": "neutral",
-              "controller": {"type": "sine"}, "task": {"type": "speed"}}  # fmt: skip
-    mixed = make_mixed_fitness(config, [body("snake")])
-    entry = CatalogueEntry("snake", "snake", "", mixed.build(body("snake")))
-    first = (Drop(0, None, 1.0, 0.0),)
-    simulation = LiveSimulation(make_tank(mixed, 2), mixed.world, [entry], first=first)
-    listener = simulation.listen()
-    thread = threading.Thread(target=simulation.run, daemon=True)
-    thread.start()
-    try:
-        simulation.ask(Rate(8.0))
-        start = simulation.ask(Current((0.0, 0.2, 0.0)))
-        name, data = "", {}
-        while name != "poses" or data["t"][-1] < 8:
-            name, data = read_event(listener.get(timeout=300))
-        start.result(PATIENCE)
-        rows = poses_of(data)[0]
-        assert np.isfinite(rows).all()
-        # Nothing holds it level or at its depth exactly, but nothing pushes it elsewhere.
-        assert rows[-1, 1] > 0.8 and abs(rows[-1, 0]) < 0.3 and abs(rows[-1, 2] + 1) < 0.3
-    finally:
-        simulation.stop()
-        thread.join(300)
 
 
 FACTS = "(document.documentElement?.dataset ?? {})"

@@ -5,7 +5,6 @@ import math
 import os
 from dataclasses import replace
 from functools import lru_cache
-from types import SimpleNamespace
 
 import av
 import mujoco
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from laboratory import ROOT, WATER, body, world
+from laboratory import ROOT, body
 from mjx_revolve import replay
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.champion import Episode
@@ -29,9 +28,7 @@ from mjx_revolve.view.film.stage import BACKGROUND, build_stage
 from mjx_revolve.view.film.video import gif_stride, make_gif, write_mp4
 from mjx_revolve.view.film.waterlight import (
     make_shader,
-    transmission,
 )
-from mjx_revolve.view.pieces import smooth_mesh
 from mjx_revolve.view.recording import Mark, Recording, ReplayRobot
 from mjx_revolve.view.swim_picture import pose_scenes
 from mjx_revolve.water.flow import Water
@@ -183,38 +180,6 @@ def test_stage_stands_as_the_robot_does(name):
         assert near.max() < 1e-5
 
 
-@pytest.mark.slow
-def test_stage_counts_from_its_origin(spider):
-    model = build_stage({0: spider}, spider.world, origin=(380.0, 20.0, -10.0), sight=5.0)
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    assert data.geom_xpos[model.geom("surface").id] == pytest.approx([0, 0, 10])
-
-
-def test_normals_are_sharp_on_a_cube_and_smooth_on_a_pipe():
-    import trimesh
-
-    cube = smooth_mesh(np.asarray(trimesh.creation.box((1, 1, 1)).triangles))
-    expected = np.repeat(cube.face_normals[:, None], 3, 1)
-    assert cube.vertex_normals[cube.faces] == pytest.approx(expected, abs=1e-9)
-    assert len(cube.faces) == 12 and cube.area == pytest.approx(6)
-    pipe = smooth_mesh(np.asarray(trimesh.creation.cylinder(1.0, 2.0, sections=32).triangles))
-    side = np.abs(pipe.face_normals[:, 2]) < 0.5
-    assert side.sum() == 64
-    outward = pipe.triangles[side] * [1, 1, 0]
-    assert (pipe.vertex_normals[pipe.faces][side] * outward).sum(-1) == pytest.approx(1, abs=0.01)
-
-
-def test_water_takes_red_first():
-    clear = np.asarray(transmission(0.0, 1.0))
-    assert clear == pytest.approx([1, 1, 1])
-    near, far = (np.asarray(transmission(x, 1.0)) for x in (1.0, 8.0))
-    assert (near > 0.75).all() and (far < 0.4).all()
-    assert far[0] < far[1] < far[2]
-    # Small robots are seen as clearly as large ones.
-    assert np.asarray(transmission(3.0, 3.0)) == pytest.approx(near, rel=1e-6)
-
-
 @lru_cache
 def shader_of(world, above):
     return make_shader(world, (32, 24), 1.0, above)
@@ -260,32 +225,6 @@ def test_frames_are_evenly_spaced_and_between_the_rows(episode):
     assert film.lost is None
 
 
-def test_a_turn_over_the_sign_of_the_quaternion_is_a_small_one(spider):
-    episode = swim(spider)
-    qpos = np.array(episode.trajectory.qpos)
-    qpos[1::2, 3:7] *= -1
-    film = make_film(replace(episode, trajectory=replace(episode.trajectory, qpos=qpos)), SIZE, 77)
-    assert np.abs(film.robots[0].qpos[:, 3]) == pytest.approx(1.0)
-
-
-def test_motes_drift_with_the_current_and_its_gusts(spider):
-    robot = build_robot(spider.morphology, load_world("lake", current=(0.1, 0, 0)))
-    film = make_film(swim(robot), SIZE, 10)
-    assert np.stack(film.water.current) == pytest.approx(np.tile([[0.1], [0], [0]], 10))
-    steps = np.arange(200)
-    gusty = Water(0.0, (0.1 + STEP * steps, 0.0 * steps, 0.0 * steps))
-    film = make_film(replace(swim(robot), water=gusty), SIZE, 10)
-    assert film.water.current[0] == pytest.approx(0.1 + film.time)
-
-
-def test_balls_hold_every_part(spider):
-    film = make_film(swim(spider), SIZE, 10)
-    for k in (0, 7):
-        scene = pose_scenes(spider, film.robots[0].qpos[k, None])[0]
-        away = np.linalg.norm(scene.corners - film.center[k], axis=-1)
-        assert away.max() < film.notes.radius[k] < 1.3 * away.max()
-
-
 def test_a_trajectory_that_fails_is_shown_up_to_there(spider):
     episode = swim(spider)
     qpos = np.array(episode.trajectory.qpos)
@@ -315,17 +254,6 @@ def test_frames_show_the_robot_in_its_colours_in_blue_water(frames):
         rows, columns = np.nonzero(salmon[18:100])
         assert rows.min() > 3 and columns.min() > 5 and columns.max() < 155
     assert np.abs(drawn[0].astype(int) - drawn[9]).max() > 50
-
-
-@pytest.mark.slow
-def test_the_bed_shows_where_it_is_near(spider, way):
-    world = load_world("lake", bed={"kind": "flat", "height": -1.3})
-    robot = build_robot(spider.morphology, world)
-    film = make_film(swim(robot, 0.1, depth=1.1), SIZE, 10)
-    assert film.shots.position[0, 2] > -1.3
-    frame = next(iter(draw_frames(film, way)))
-    low = frame[95:110, 60:].reshape(-1, 3).mean(0)
-    assert low[0] > 80  # sand is no water
 
 
 def moving_dot(count=30, size=SIZE):
@@ -368,45 +296,6 @@ def test_gif_reads_back_with_the_film_s_time_and_colours():
             np.abs(np.asarray(gif.convert("RGB"), int)[60, 10 * k + 10] - (220, 60, 40)).max() < 8
         )
     assert total == 1000
-
-
-def test_current_and_target_are_shown():
-    """An arrow and a number in the corner; a ring on the target, or an arrow at the edge."""
-    robot = build_robot(body("core"), world(**WATER, current=(0.0, 0.1, 0.0)))
-    time = 0.02 * np.arange(1, 51)
-    qpos = np.tile(robot.start_qpos(), (50, 1))
-    still = np.zeros((50, 0))
-    rows = Trajectory(time, qpos, np.zeros((50, 6)), np.zeros((50, 2, 3)), still, 0 * time)
-
-    def signs(frame, target=None, rows=rows):
-        """Words in a frame, their places, and how many pixels are pink."""
-        fitness = SimpleNamespace(config=SimpleNamespace(task=SimpleNamespace(target=target)))
-        film = make_film(Episode("core", robot, rows, fitness=fitness), (320, 240), 10)
-        blank, words = np.zeros((240, 320, 3), np.uint8), []
-        with pytest.MonkeyPatch.context() as patch:
-            write = overlay.Pen.write
-            patch.setattr(
-                overlay.Pen, "write", lambda *a, **k: words.append(a[1:4]) or write(*a, **k)
-            )
-            drawn = overlay.make_overlay(film)(blank, np.full((240, 320), np.inf), frame)
-        said = {text: (x, y) for x, y, text in words if "current" in text or "target" in text}
-        return said, int((np.abs(drawn.astype(int) - overlay.AIM[:3]).max(-1) < 40).sum())
-
-    assert [*signs(3)[0]] == ["current 0.10 m/s"]
-    x, y, z = qpos[0, :3]
-    said, pixels = signs(3, (x, y, z + 0.05))
-    assert [*said] == ["current 0.10 m/s", "target, 0.05 m"] and pixels > 30
-    at = said["target, 0.05 m"]
-    assert 100 < at[0] < 220 and 40 < at[1] < 180  # not far from the robot
-    said, pixels = signs(3, (x + 5.0, y, z))
-    assert "target, 5 m" in said and pixels > 30
-    # One that moves is where the trajectory has it: 2 m away at the start, and 1 m nearer a second
-    # on.
-    way = qpos[:, :3] + np.array([1.0, 0, 0]) * (2 - time[:, None])
-    moving = replace(rows, target=way)
-    assert (
-        "target, 1.8 m" in signs(2, rows=moving)[0] and "target, 1.1 m" in signs(9, rows=moving)[0]
-    )
 
 
 @pytest.fixture(scope="module")
@@ -462,17 +351,6 @@ def test_the_camera_circles_and_sees_most(depth, above):
         flat, away = shots.project(frame, places[:, frame])
         inside = (np.abs(flat) < (4 / 3, 1)).all(1) & (away > 0)
         assert inside.mean() >= 0.75
-
-
-def test_the_camera_stays_where_no_robot_is_left():
-    alive = np.zeros((1, 20), bool)
-    alive[0, :5] = True
-    places = np.ones((1, 20, 3)) * (1.0, 2.0, -1.0)
-    shots = plan_circle(np.arange(20) / 10, places, alive, reach=0.2, aspect=1.0, surface=10.0)
-    assert np.isfinite(shots.position).all()
-    assert np.linalg.norm(shots.position - (1.0, 2.0, -1.0), axis=1) == pytest.approx(
-        np.full(20, shots.distance)
-    )
 
 
 @pytest.mark.slow
@@ -593,28 +471,6 @@ def test_no_opengl_is_one_line_that_says_what_to_install(command, tmp_path, monk
         assert "apt-get install libegl1 libgl1-mesa-dri" in error
 
 
-def test_the_user_s_opengl_is_the_only_one_tried(monkeypatch):
-    tried = []
-    monkeypatch.setattr(opengl, "_works", lambda way: tried.append(way) or True)
-    monkeypatch.setattr(opengl.sys, "platform", "linux")
-    monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    assert opengl.find_opengl() == "osmesa" and tried == ["osmesa"]
-    monkeypatch.setenv("MUJOCO_GL", "vulkan")
-    with pytest.raises(InputError, match="MUJOCO_GL: expected one of egl, osmesa, glfw; found"):
-        opengl.find_opengl()
-    monkeypatch.setenv("MUJOCO_GL", "off")
-    with pytest.raises(InputError, match="switched off"):
-        opengl.find_opengl()
-    monkeypatch.delenv("MUJOCO_GL")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.setattr(opengl, "_works", lambda way: tried.append(way) or way == "glfw")
-    with pytest.raises(InputError, match="expected one of egl, osmesa to draw with"):
-        opengl.find_opengl()
-    monkeypatch.setenv("DISPLAY", ":0")
-    assert opengl.find_opengl() == "glfw"
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -628,23 +484,6 @@ def test_wrong_options(words, message, tmp_path, capsys):
     assert run_command(replay.main, [str(tmp_path / "spider.yaml"), *words]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1 and error.startswith("error: ")
-
-
-def test_a_place_that_cannot_be_written(command, way, tmp_path, capsys):
-    source = tmp_path / "spider.yaml"
-    source.touch()
-    (tmp_path / "file").touch()
-    for name, message in (
-        ("file/x.mp4", "file/x.mp4: expected the folder"),
-        ("file/x", "file/x: expected the folder"),
-        ("file", "expected a folder, or a name that ends in .mp4, .gif, .html; found another file"),
-        ("x.avi", "expected a folder, or a name that ends in .mp4, .gif, .html; found '.avi'"),
-    ):
-        assert command(str(source), "--out", str(tmp_path / name)) == 2
-        error = capsys.readouterr().err
-        assert error.startswith("error: ") and error.count("\n") == 1 and message in error
-    assert command(str(source), "--html", "--out", str(tmp_path / "v0.2")) == 0
-    assert [path.name for path in (tmp_path / "v0.2").iterdir()] == ["viewer.html"]
 
 
 @pytest.mark.skipif(not os.sys.platform.startswith("linux"), reason="Linux's screens")

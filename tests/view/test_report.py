@@ -1,6 +1,5 @@
 """Reports: what is read of whole and damaged runs, the statistics, the pictures and the page."""
 
-import errno
 import json
 import shutil
 from html.parser import HTMLParser
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 
 from laboratory import _ELBOW as ELBOW
-from laboratory import read
 from mjx_revolve import evolve, inspect, passport, report
 from mjx_revolve.episodes.config import load_config, make_config
 from mjx_revolve.episodes.fitness import make_fitness
@@ -24,8 +22,7 @@ from mjx_revolve.numerics import runtime
 from mjx_revolve.view import convergence, motion_plots, plots
 from mjx_revolve.view.report import page as report_page
 from mjx_revolve.view.report import repeat as report_repeat
-from mjx_revolve.view.report import tables
-from mjx_revolve.view.report.champion import cpg_phases, replay_champion
+from mjx_revolve.view.report.champion import replay_champion
 from mjx_revolve.view.report.data import read_run
 from mjx_revolve.view.report.groups import differences, group_runs
 from mjx_revolve.view.statistics import interval
@@ -221,17 +218,6 @@ def test_damages_are_named_and_the_rest_is_read(copy, damage, state, text):
         assert plots.figure_svg(convergence.plot_fitness(record.metrics)).startswith(b"<?xml")
 
 
-@pytest.mark.slow
-def test_values_of_the_wrong_kind_do_not_stop_a_report(copy, quick, capsys):
-    info = json.loads((copy / "run.json").read_text())
-    info |= {"champion": {"score": 10**400, "measures": [1]}, "versions": {"jax": 1}, "git": 7,
-             "threads": "?", "settings": "?", "resumed": [3], "config_file": None}  # fmt: skip
-    (copy / "run.json").write_text(json.dumps(info))
-    (copy / "inputs" / "elbow.yaml").write_bytes(b"\xff\xfe")
-    assert run_main("run") == 0
-    assert "Repeat it" in Page((copy / "report.html").read_text()).words
-
-
 def test_metrics_of_another_version_may_lack_columns(tmp_path):
     path = tmp_path / "metrics.csv"
     path.write_text("generation,best\r\n2,0.5\r\n1,inf\r\n2,0.6\r\n")
@@ -252,15 +238,6 @@ def test_what_is_no_run_is_refused(tmp_path, make):
         read_run(tmp_path / "thing")
 
 
-def test_a_folder_of_damaged_files_is_refused_with_the_reason(copy):
-    shutil.rmtree(copy / "checkpoints")
-    for path in copy.rglob("*"):
-        if path.is_file():
-            path.write_bytes(b"\0\1")
-    with pytest.raises(InputError, match=r"run: expected a run folder; found run.json: expected J"):
-        read_run(copy)
-
-
 def test_the_replay_scores_as_evolution_did(lab, copy):
     replay = lab["replay"]
     assert replay.score == lab["score"]
@@ -278,23 +255,6 @@ def test_genes_of_another_controller_are_refused(lab, copy):
     (copy / "champion" / "genes.yaml").write_text("genes: [1.0, 2.0]")
     with pytest.raises(InputError, match=r"genes: expected 3, as config.yaml has it; found 2"):
         replay_champion(read_run(copy), lab["fitness"])
-
-
-def test_phases_of_oscillators_without_neighbours_turn_evenly(lab):
-    fitness = lab["fitness"]
-    genes = np.float32([0.9, -0.6, 0.0])
-    phases = np.unwrap(cpg_phases(fitness, genes, 100), axis=0)
-    seconds = fitness.robot.world.timestep * np.arange(1, 101)
-    assert np.allclose(phases, 2 * np.pi * np.sin(genes[:2]) * seconds[:, None], atol=1e-4)
-    trajectory = fitness.replay(genes, replay_key(0))
-    low, high = fitness.robot.mj_model.actuator_ctrlrange.T
-    # Commands are due every tenth step, of the phases then, and targets go there in ten steps.
-    due = np.concatenate([np.zeros((1, 2)), phases[9:99:10]])
-    commands = (low + high) / 2 + (high - low) / 2 * np.tanh(np.sin(due))
-    before = np.concatenate([commands[:1], commands[:-1]])
-    way = np.tile(np.arange(10) / 10, 10)[:, None]
-    expected = before.repeat(10, axis=0) + way * (commands - before).repeat(10, axis=0)
-    assert np.allclose(trajectory.ctrl[:100], expected, atol=1e-4)
 
 
 def axes_of(figure):
@@ -325,43 +285,6 @@ def test_power_adds_up(lab):
     assert final == pytest.approx(replay.measures["cost_of_transport"], rel=0.01)
 
 
-def test_phases_and_thrusters(lab):
-    phases = axes_of(motion_plots.plot_phases(lab["replay"].motion))
-    assert phases[0].images[0].get_array().shape == (2, 200)
-    assert phases[0].images[0].get_cmap().name == "twilight"  # a circle: 0 and 2π look the same
-    from types import SimpleNamespace
-
-    time = np.arange(400) * 0.01
-    command = np.sin(40 * time)[:, None]
-    model = SimpleNamespace(actuator=lambda i: SimpleNamespace(name="bow"))
-    robot = SimpleNamespace(thrusters=(0,), mj_model=model)
-    motion = SimpleNamespace(robot=robot, time=time, commands=command, lagged=0.5 * command)
-    (axes,) = axes_of(motion_plots.plot_thrusters(motion))
-    assert np.ptp(axes.lines[0].get_xdata()) < 2.0  # the last of many swings
-    assert np.ptp(axes.lines[1].get_ydata()) == pytest.approx(1.0, abs=0.05)
-
-
-def test_comparison_of_very_different_lengths(lab, tmp_path):
-    config = lab["config"]
-    made = []
-    for generations in (3, 40):
-        changed = make_config(config.model_dump(), "/", [f"evolution.generations={generations}"])
-        for seed in range(3):
-            folder = tmp_path / f"{generations}-{seed}"
-            make_run(folder, changed, lab["fitness"], seed, generations)
-            made.append(read_run(folder))
-    groups = group_runs(made)
-    styles = {group.name: k for k, group in enumerate(groups)}
-    left, right = axes_of(convergence.plot_comparison(groups, styles))
-    assert left.get_xscale() == "log"
-    # Each seed, then their mean.
-    assert np.allclose(left.lines[3].get_ydata(), np.mean(groups[0].curve("champion")[1], axis=0))
-    assert [tick.get_text() for tick in right.get_xticklabels()] == ["A", "B"]
-    (same,) = group_runs(made[:3])
-    left, _ = axes_of(convergence.plot_comparison([same], {same.name: 0}))
-    assert left.get_xscale() == "linear"
-
-
 @pytest.mark.slow
 def test_searches_in_which_everything_fails_make_pictures(lab, tmp_path):
     make_run(tmp_path / "0", lab["config"], lab["fitness"], 0, 1)
@@ -385,24 +308,6 @@ def test_pictures_are_the_same_bytes_twice():
     assert b"<text" not in first  # no fonts needed
 
 
-def test_modules_are_counted_and_weighed():
-    elbow = read(ELBOW)
-    rows, foot = tables.count_modules(elbow)
-    modules = tables.list_modules(elbow)
-    descriptors = tables.list_descriptors(elbow)
-    robot = {"heading": "elbow", "rows": rows, "foot": foot, "modules": modules}
-    robot["descriptors"] = descriptors
-    page = report_page.sections.robots([robot])
-    assert '<td class="left">FixedBrick</td><td>2</td><td>10.2</td><td>20.4</td>' in page
-    assert f"<td>{1e3 * elbow.mass:.4g}</td>" in page
-    assert "41 × 41 × 35.5" in page
-    assert [row[1] for row in modules] == [module.name for module in elbow.modules]
-    assert all(f'<td class="left">{module.name}</td>' in page for module in elbow.modules)
-    assert len(descriptors) == len(elbow.descriptors)
-    assert ["absolute size", f"{elbow.num_modules}", "modules"] in descriptors
-    assert '<td class="left">absolute size</td>' in page
-
-
 def test_the_commands_give_the_same_settings(lab, copy):
     record = read_run(copy)
     (own_words, own), (words, started) = report_repeat.repeat_commands(record)
@@ -414,22 +319,6 @@ def test_the_commands_give_the_same_settings(lab, copy):
         config = load_config(arguments.config, [*arguments.settings, *seed])
         assert settings_hash(config) == settings_hash(record.config)
     assert "--seed 0 --set controller.max_frequency=1.0" in started
-
-
-def test_a_command_that_no_longer_fits_is_not_shown(lab, copy):
-    source = copy.parent / "swim.yaml"
-    shutil.copy(lab["folder"] / "elbow.yaml", copy.parent)
-    shutil.copy(lab["folder"] / "swim.yaml", source)
-    runs.RunFolder(copy).update_info(config_file=str(source))
-    commands = report_repeat.repeat_commands(read_run(copy))
-    assert commands[1][1].startswith("python -m mjx_revolve.evolve swim.yaml --seed 0 ")
-    edit(source, '"duration": 1.0', '"duration": 2.0')
-    assert len(report_repeat.repeat_commands(read_run(copy))) == 1
-    source.unlink()
-    assert len(report_repeat.repeat_commands(read_run(copy))) == 1
-    runs.RunFolder(copy).update_info(xla_flags="--a --b", threads={"OPENBLAS_NUM_THREADS": "2"})
-    ((_, command),) = report_repeat.repeat_commands(read_run(copy))
-    assert command.startswith("OPENBLAS_NUM_THREADS=2 XLA_FLAGS='--a --b' python -m ")
 
 
 class Page(HTMLParser):
@@ -606,13 +495,3 @@ def test_wrong_commands(copy, argv, message, capsys):
     assert err.startswith("error: ") and err.count("\n") == 1
     assert sorted(copy.parent.rglob("*")) == before
     assert (copy / "report.html").read_text() == "mine"
-
-
-def test_a_full_disk_is_one_line(copy, quick, capsys, monkeypatch):
-    def full(path, content):
-        raise OSError(errno.ENOSPC, "No space left on device", str(path))
-
-    monkeypatch.setattr(report, "write_atomic", full)
-    monkeypatch.setattr(report_page, "make_report", lambda *_: "a page")
-    assert run_main("run", "--out", "page.html") == 1
-    assert capsys.readouterr().err == "error: page.html: No space left on device\n"

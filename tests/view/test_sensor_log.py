@@ -136,9 +136,3 @@ def test_the_picture_has_each_sensor_once():
     assert len(figure_svg(figure)) < 400_000
     assert figure_svg(plot_sensors(time, felt[:1])) == figure_svg(plot_sensors(time, felt[:1]))
     assert len(plot_sensors(time, [felt[2]]).axes) == 2  # strips alone, and their bar
-
-
-def test_brains_that_feel_nothing_declared_have_no_picture(tmp_path):
-    fitness = make_fitness(make_config(config(tmp_path, controller={"type": "cpg"})))
-    assert fitness.controller.observer is None
-    assert trace_sensors(fitness, None, KEY) == ()

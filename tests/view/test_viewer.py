@@ -15,10 +15,9 @@ from scipy.spatial import cKDTree
 from browser import Browser, needs_browser
 from laboratory import QUICK, ROOT, WATER, body, box_robot, world
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.episodes import champion
 from mjx_revolve.episodes.champion import Episode
 from mjx_revolve.episodes.simulate import Trajectory
-from mjx_revolve.inputs.commands import Parser, add_episode_arguments, run_command
+from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.episode_data import episode_data
 from mjx_revolve.view.forces import module_forces, sum_modules
@@ -166,14 +165,6 @@ def test_pieces_put_together_are_the_robot(robots):
     assert cKDTree(found).query(expected)[0].max() < 5e-5
 
 
-def test_robots_that_look_alike_share_their_meshes(robots):
-    meshes = RobotMeshes()
-    other = build_robot(body("spider"), robots["spider"].world)
-    assert [meshes.add(robot) for robot in (*robots.values(), other)] == [0, 1, 2, 0]
-    assert len(meshes.bodies) == 3
-    assert len(meshes.shapes) == 4  # core, brick, and a hinge's two parts
-
-
 def unpack_poses(packed, widths):
     raw = zlib.decompress(base64.b64decode(packed["poses"]))
     rows = packed["rows"]
@@ -207,17 +198,6 @@ def test_poses_come_back(robots, steps):
         assert qpos[:, :3] == pytest.approx(expected[:, :3], abs=0.51 * step)
         assert qpos[:, 7:] == pytest.approx(expected[:, 7:], abs=0.51 * steps[2])
         assert np.abs((qpos[:, 3:7] * expected[:, 3:7]).sum(1)) == pytest.approx(1, abs=2e-3)
-
-
-def test_jumps_are_kept_more_coarsely(robots):
-    """A robot may be put elsewhere: two bytes hold that, too."""
-    qpos = poses(robots["snake"], 3)
-    qpos[:, :3] = [[0, 0, 0], [100.0, 0, 0], [-100.0, 0, 0]]
-    packed = pack_poses([np.arange(3.0)], [qpos], (1e-3, 5e-4, 2e-3))
-    step = packed["steps"][0]
-    assert step == pytest.approx(200 / 32000)
-    [(_, found)] = unpack_poses(packed, [15])
-    assert found[:, :3] == pytest.approx(qpos[:, :3], abs=0.51 * step)
 
 
 def data_of(path):
@@ -309,17 +289,6 @@ def test_waves():
     assert height == pytest.approx(float(expected), abs=1e-6)
 
 
-def test_dust_goes_with_the_water():
-    """With the world's current, or with that of the episode."""
-    episode = small_episode(world(current=(0.2, 0.0, -0.1)))
-    drift = unpack(episode_data(episode)["episode"]["drift"], -1, 3)
-    assert drift[-1] == pytest.approx(np.array([0.2, 0, -0.1]) * 0.48, rel=1e-4)
-    gust = np.linspace(0.0, 1.0, 100)
-    episode = replace(episode, water=Water(0.0, (0.0, gust, 0.0)))
-    drift = unpack(episode_data(episode)["episode"]["drift"], -1, 3)
-    assert drift[-1] == pytest.approx([0, 0.02 * gust[1:97:4].sum(), 0], rel=1e-4)
-
-
 def test_current_and_target(episode, data):
     """The water's velocity along the way, where it moves, and where the task sends the robot."""
     assert data["episode"]["current"] is None and data["episode"]["target"] is None
@@ -340,20 +309,6 @@ def test_current_and_target(episode, data):
     assert unpack(fled["episode"]["target"], -1, 3) == pytest.approx(
         way[:: len(way) // fled["rows"][0]], rel=1e-6
     )
-
-
-def test_bed():
-    """Where it is in sight: the world's heights on rings around the way."""
-    assert episode_data(small_episode(world()))["world"]["bed"] is None
-    assert episode_data(small_episode(world(bed=-80.0)))["world"]["bed"] is None
-    bed = episode_data(small_episode(world(bed=-4.0)))["world"]["bed"]
-    height = unpack(bed["height"], bed["rings"], bed["sectors"])
-    assert height == pytest.approx(-4.0)
-    lake = load_world("lake", bed={"kind": "lake", "height": -3.0, "highest": 5.0, "extent": 60.0})
-    bed = episode_data(small_episode(lake))["world"]["bed"]
-    height = unpack(bed["height"], bed["rings"], bed["sectors"])
-    assert height[0] == pytest.approx(-3.0)
-    assert height.max() == pytest.approx(5.0)
 
 
 def test_stops_where_numbers_end():
@@ -471,25 +426,6 @@ def test_page_opens_and_plays(browser, page):
 
 @pytest.mark.slow
 @needs_browser
-def test_robot_is_in_the_picture(browser, page):
-    """The spider's coral and indigo near the middle, and it moves."""
-    browser.open(page, "#plain&paused&t=2&hide=trail")
-    picture = browser.picture()
-    r, g, b = np.moveaxis(picture[60:240, 120:360], -1, 0)
-    coral, indigo = (r > g + 40) & (r > b + 20), (b > g + 30) & (b > r + 40)
-    assert coral.sum() > 500 and indigo.sum() > 500
-    low, high = np.argwhere(coral).min(0), np.argwhere(coral).max(0)
-    assert np.all(high - low > 60)  # four limbs all around the core
-    for _ in range(4):
-        browser.press("ArrowRight")
-    later = browser.picture()
-    assert float(browser.fact("time")) == pytest.approx(2.4)
-    assert changed(picture, later) > 2000
-    assert browser.errors == []
-
-
-@pytest.mark.slow
-@needs_browser
 def test_switches_change_the_picture(browser, page):
     browser.open(page, "#plain&paused&t=3&view=below")
     for name, most in (("buoyancy", 300), ("drag", 100), ("trail", 100), ("grid", 100),
@@ -502,60 +438,6 @@ def test_switches_change_the_picture(browser, page):
     scale = browser.evaluate("document.querySelector('#drag .unit').textContent")
     assert re.fullmatch(r"[0-9.e-]+ N", scale)
     assert browser.evaluate("document.getElementById('thrust').disabled") is True
-    assert browser.errors == []
-
-
-@needs_browser
-@pytest.mark.slow
-def test_other_worlds_draw(browser, tmp_path):
-    """Waves from above, a bed and thrusters: every shader compiles, every arrow is there."""
-    waves = [{"amplitude": 0.05, "wavelength": 1.5}]
-    sea = load_world("lake", waves=waves, bed=-2.3, current=(0.1, 0, 0))
-    robot = build_robot(body("auv"), sea)
-    path = tmp_path / "auv.html"
-    config = SimpleNamespace(task=SimpleNamespace(target=(0.5, 0.0, -1.5)))
-    fitness = SimpleNamespace(config=config)
-    write_viewer(Episode("auv", robot, made_up(robot, 1.0), fitness=fitness), path)
-    browser.open(path, "#plain&paused&t=0.5&elevation=40&distance=12")
-    assert changed(browser.picture(), np.zeros(3)) > 0.9 * SIZE[0] * SIZE[1]
-    browser.open(path, "#plain&paused&t=0.5")
-    before = browser.picture()
-    browser.press("h")
-    assert changed(before, browser.picture()) > 100
-    assert browser.errors == []
-
-
-@pytest.mark.slow
-@needs_browser
-def test_robots_appear_and_vanish(browser, colony):
-    browser.open(colony, "#plain&paused&t=1")
-    assert browser.evaluate("document.title") == "Three {{lives}}</title>"
-    for time, alive in ((1, "2"), (6, "1"), (9, "2")):
-        scrub = f"const s = document.getElementById('scrub'); s.value = {time};"
-        browser.evaluate(f"{{ {scrub} s.dispatchEvent(new Event('input')); }}")
-        assert browser.fact("alive") == alive
-    names = "[...document.querySelectorAll('#list b')].map((x) => x.textContent).join('|')"
-    assert browser.evaluate(names) == "first|later <b>"
-    browser.press(" ")
-    frames = int(browser.fact("frames"))
-    browser.wait(f"document.documentElement.dataset.frames > {frames + 2}")
-    assert browser.errors == []
-    assert [address for address in browser.requests if not address.startswith("file:")] == []
-
-
-@pytest.mark.slow
-@needs_browser
-def test_a_robot_is_followed(browser, colony):
-    """The spider's coral and indigo in the middle, and what is known of it on the page."""
-    browser.open(colony, "#plain&paused&t=2&follow=0&hide=trail")
-    assert browser.evaluate("document.querySelector('#followed').hidden") is False
-    assert browser.evaluate("document.querySelector('[data-fact=energy]').textContent") == "1.235"
-    speed = browser.evaluate("document.querySelector('[data-fact=speed]').textContent")
-    assert speed == "0.100 m/s"
-    r, g, b = np.moveaxis(browser.picture()[60:240, 120:360], -1, 0)
-    assert ((r > g + 40) & (r > b + 20)).sum() > 300 and ((b > g + 20) & (b > r + 30)).sum() > 300
-    browser.press("Escape")
-    assert browser.fact("followed") == ""
     assert browser.errors == []
 
 
@@ -598,34 +480,6 @@ def test_command(tmp_path, monkeypatch, capsys, quick_compiles):
     assert run_command(main, [CORE]) == 2
     assert capsys.readouterr().err.startswith("error: box.html: expected no such file yet; name")
     assert main([CORE, "--out", "box.html"]) == 0
-
-
-FLOAT = """
-modules:
-  Float:
-    mount: -x
-    parts:
-      - {name: foam, size: [0.04, 0.04, 0.04], mass: 0.01}
-"""
-BUOY = "id: buoy\nbody: {type: Core, children: {1: {id: float, type: Float}}}\n"
-
-
-def test_robots_of_modules_of_ones_own(tmp_path, monkeypatch):
-    """Named by `--modules`, for viewer, replay and export alike; a run has its own."""
-    (tmp_path / "mine.yaml").write_text(FLOAT)
-    (tmp_path / "buoy.yaml").write_text(BUOY)
-    (tmp_path / "genes.yaml").write_text("genes: [0.1]\n")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(champion, "simulate", lambda robot, *_, **__: made_up(robot, 0.5))
-    parser = Parser()
-    add_episode_arguments(parser)
-    arguments = parser.parse_args(["buoy.yaml", "--modules", "mine.yaml"])
-    body = champion.load_asked(arguments).robot.morphology
-    assert [module.type for module in body.modules] == ["Core", "Float"]
-    with pytest.raises(InputError, match=r"buoy.yaml: .*Float"):
-        champion.load_episode("buoy.yaml")
-    with pytest.raises(InputError, match="modules: expected none: a run's configuration names"):
-        champion.load_episode("genes.yaml", modules="mine.yaml")
 
 
 @pytest.mark.parametrize(

@@ -5,19 +5,14 @@ from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
-from laboratory import QUICK, accelerate, at_rest, body, box_robot, march, world
+from laboratory import accelerate, at_rest, body, box_robot, march, world
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import trim_neutral
-from mjx_revolve.engine.forces import part_forces
-from mjx_revolve.engine.population import init
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.engine.single_tree import make_single_tree
 from mjx_revolve.water.buoyancy import BUOYANCY_LAWS, buoyancy, cut_box
-from mjx_revolve.water.flow import water_of
 from references import clip_box
 
 WATER = 999.1026  # kg/m³, the thesis's
@@ -329,39 +324,3 @@ def test_a_box_is_cut_where_it_is_wherever_its_volume_has_its_centre():
     assert -found[3] == pytest.approx(torque / (mass * size**2 / 6), abs=1e-9)
     found = accelerate(box(world(gravity=G, buoyancy="mask")), qpos, np.zeros((6, 5)))
     assert found[2, 3:] == pytest.approx([-G, G], abs=1e-12)
-
-
-def part_buoyancy(robot, qpos, qvel):
-    """`[lanes, npart, 3]` buoyancy of each part, world frame."""
-    with jax.enable_x64(True):
-        levels = make_single_tree(robot)
-        state = init(levels, jnp.asarray(qpos), jnp.asarray(qvel))
-        thrusts = jnp.zeros((robot.num_thrusters, qpos.shape[1]))
-        run = jax.jit(partial(part_forces, levels), compiler_options=QUICK)
-        return np.asarray(run(state, water_of(robot.world), thrusts)[0])
-
-
-@pytest.mark.slow
-def test_the_shipped_auv_is_cut_where_its_core_is():
-    """Its ballast's volume puts the core's centre of volume 4.7 mm off the box's.
-
-    Half its core's box is under water where the core's centre is, at any attitude about it.
-    """
-    robot = build_robot(body("auv"), world(gravity=G, buoyancy="partial"))
-    fluid = robot.fluid
-    core = int(fluid.volume.argmax())
-    off = np.linalg.norm(fluid.center_of_volume[core])
-    assert off > 2e-3
-    quat = np.random.default_rng(4).normal(size=(4, 8))
-    qpos, qvel = at_rest(robot, 8)
-    qpos[3:7] = quat / np.linalg.norm(quat, axis=0)
-    data, forces = mujoco.MjData(robot.mj_model), part_buoyancy(robot, qpos, qvel)
-    for lane in range(8):
-        data.qpos[:] = qpos[:, lane]
-        mujoco.mj_kinematics(robot.mj_model, data)
-        for p, whole in enumerate(WATER * G * fluid.volume):
-            turn = data.xmat[fluid.body[p]].reshape(3, 3)
-            depth = -(data.xpos[fluid.body[p]] + turn @ fluid.position[p])[2]
-            up = (turn @ fluid.rotation[p])[2]
-            share, _ = clip_box(up, depth, fluid.half_size[p])
-            assert forces[lane, p] == pytest.approx([0, 0, share * whole], abs=1e-9)

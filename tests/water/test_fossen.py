@@ -13,8 +13,6 @@ from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.population import acceleration
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.formats.mjcf import make_mjcf
-from mjx_revolve.formats.sdf import make_sdf
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.flow import water_of
 
@@ -189,13 +187,6 @@ def test_different_bodies_side_by_side_and_gradients():
         assert np.asarray(found)[:6, k] == pytest.approx(alone[:, 0], rel=1e-9)
     # A chunk without such parts has the same tables.
     pack_bodies(robots[1:2], capacity)
-
-
-def test_files_for_other_programs_say_what_they_can(stated):
-    sdf = make_sdf(stated)
-    assert "<xU>-1</xU>" in sdf and "<xUabsU>-3</xUabsU>" in sdf and "<yP>-0.02</yP>" in sdf
-    assert "<xq>0.05</xq>" in sdf and "<yr>-0.06</yr>" in sdf and "<qq>0.03</qq>" in sdf
-    assert "stated damping (fossen)" in " ".join(make_mjcf(stated).split())
 
 
 def test_a_bluerov2_is_the_published_one():

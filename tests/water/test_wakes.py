@@ -14,7 +14,7 @@ from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.batched_trees import make_batched_trees
-from mjx_revolve.engine.population import PopulationEngine, make_population_engine
+from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.numerics.spatial import dot
 from mjx_revolve.water.cross_flow import CROSS_FLOW
@@ -263,18 +263,3 @@ def test_both_engines_and_bodies_side_by_side_remember_alike():
 
     end = jax.jit(lambda s: jax.lax.scan(step, s, jnp.asarray(ctrl[:, 0, 0]))[0])(start)
     np.testing.assert_allclose(engine.observe(end)[1][:, 0], one[1][-1][:, 0], atol=1e-8)
-
-
-@pytest.mark.slow
-def test_steps_converge_and_need_no_added_mass():
-    ends = []
-    for dt in (0.01, 0.005, 0.0025):
-        robot = swimmer(timestep=dt)
-        qpos, qvel = at_rest(robot, 1, -5.0)
-        qvel[0] = 0.2
-        steps = round(1.0 / dt)
-        ends.append(march(robot, 1.0, qpos, qvel, stroke(robot, steps), every=steps)[1][-1, :3, 0])
-    first, second = (np.linalg.norm(ends[k] - ends[k + 1]) for k in range(2))
-    assert second < 0.7 * first and second < 0.03 * np.linalg.norm(ends[2] - [0, 0, -5.0])
-    state = make_population_engine(robot).init(*map(jnp.asarray, (qpos, qvel)))
-    assert state.submerged and jax.tree.leaves(state.submerged)

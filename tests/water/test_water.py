@@ -280,19 +280,6 @@ def test_interpolation_and_edges_against_scipy(axes):
     assert np.allclose(found[:, 2000:], field.velocity.reshape(-1, 3).T, rtol=0, atol=1e-12)
 
 
-def test_an_axis_with_one_plane_does_not_matter():
-    x, y, z = EVEN
-    plane = grid((x, y, z[:1]))
-    place = places()
-    for axes in ((x, y, z), (x, y, np.array([-2.0, 7.0]))):
-        thick = np.repeat(plane.velocity, len(axes[2]), 2)
-        same = moving(make_world(current_field=CurrentField(*axes, thick)), place)[0]
-        found = moving(make_world(current_field=plane), place)[0]
-        assert np.allclose(found, same, rtol=0, atol=1e-13)
-    point = CurrentField([1.0], [2.0], [3.0], np.array([0.1, 0.2, 0.3]).reshape(1, 1, 1, 3))
-    assert np.all(moving(make_world(current_field=point), place)[0].T == [0.1, 0.2, 0.3])
-
-
 def test_a_component_that_is_nowhere_costs_nothing():
     field = CurrentField(*EVEN, grid(EVEN).velocity * [1.0, 1.0, 0.0])
     world = make_world(current_field=field)
@@ -411,16 +398,3 @@ def test_gusts_have_the_mean_variance_and_memory_that_were_asked_for(relative):
     assert abs(added.var() - 1) < 4.5 * np.sqrt(2 / added.size)
     assert abs(np.mean(added[1:] * added[:-1])) < 4.5 / np.sqrt(added.size)
     assert abs(np.mean(added * u[:-1])) < 4.5 / np.sqrt(added.size)
-
-
-def test_gusts_belong_to_their_key():
-    gust = Gust(tuple(STD), time=4.0)
-    path = gust_path(gust, jax.random.key(3), 40, 0.1, 5)
-    assert np.array_equal(path, gust_path(gust, jax.random.key(3), 40, 0.1, 5))
-    assert not np.any(path == gust_path(gust, jax.random.key(4), 40, 0.1, 5))
-    # A longer episode begins like a shorter one.
-    assert np.array_equal(path, gust_path(gust, jax.random.key(3), 90, 0.1, 5)[:41])
-    drawn = jax.jit(lambda key: gust_path(gust, key, 40, 0.1, 5))
-    assert np.allclose(drawn(jax.random.key(3)), path, rtol=0, atol=1e-6)
-    keys = jax.vmap(jax.random.key)(jnp.arange(4))
-    assert np.allclose(jax.vmap(drawn)(keys)[3], path, rtol=0, atol=1e-6)

@@ -423,13 +423,6 @@ def test_lake_is_always_the_same_and_has_shore_slope_and_basin():
     assert np.diff(np.sign(np.diff(first[60], 2))).any()  # dunes
 
 
-def test_lake_heights_of_other_extents():
-    bed = Bed(kind="lake", height=-3.0, highest=1.0, extent=20.0)
-    heights = sample_bed(bed, 51)
-    assert heights.max() == pytest.approx(1.0)
-    assert heights[25, 25] == pytest.approx(-3.0)
-
-
 def test_slope_against_finite_differences():
     """Central differences in float64 over 2 cm: the same numbers; over 1 mm: to what dunes bend."""
     import jax
@@ -445,12 +438,6 @@ def test_slope_against_finite_differences():
     assert slope[0] == pytest.approx(fine[0], abs=1e-4)
     assert slope[1] == pytest.approx(fine[1], abs=1e-4)
     assert np.hypot(*slope).max() < 1.0
-
-
-def test_a_flat_bed():
-    x = np.zeros(3, np.float32)
-    assert np.all(np.asarray(bed_height(Bed(height=-7.0), x, x)) == -7.0)
-    assert not any(np.any(np.asarray(s)) for s in bed_slope(Bed(), x, x))
 
 
 def test_a_gas_is_worth_a_note(caplog):
