@@ -96,7 +96,7 @@ def test_acceleration_in_float32():
 
 
 @pytest.mark.slow
-@pytest.mark.sampled(6)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("path", REAL, ids=lambda p: f"{p.parent.name}-{p.stem}")
 def test_acceleration_of_real_bodies(path):
     """Every shipped and wild morphology in MuJoCo's inertia box, float32."""

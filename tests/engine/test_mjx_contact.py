@@ -218,7 +218,7 @@ def test_a_current_moves_it_where_friction_gives_way(wet):
     assert 0.1 < v[-1, 0, 7] < 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_jointed_without_water_it_is_mujocos_step():
     """An elbow tips onto its corners; its hinges are soft springs, without what is ours alone.
 
@@ -268,7 +268,7 @@ def test_a_slope_is_slid_down_as_coulomb_has_it():
     assert v[-1, :3, 0] @ turn == pytest.approx([expected * time[-1], 0, 0], abs=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_core_lands_in_the_lake():
     """On the height field's triangles, that are within 4 mm of the lake's shape."""
     robot = build_robot(body("core"), load_world("lake", bed={"contact": "mjx"}))

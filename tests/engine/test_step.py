@@ -440,7 +440,7 @@ def test_gradient_in_waves_and_in_contact():
     check_slope(build_robot(body("core"), tank), afloat, sliding)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_gradient_through_thrusters():
     """In the commands, behind their lag; one of them stands still."""
     inputs = {"ctrl": np.array([0.5, -0.3, 0.0, 0.8]), "qvel": np.full(6, 0.05)}

@@ -78,7 +78,7 @@ def test_a_blown_up_individual_scores_worst_and_spreads_nothing(fitness, populat
     np.testing.assert_array_equal(found[others], scores[others])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_mjx_scores_the_same(settings, population, scores):
     slow = make_fitness(settings, engine="mjx")
     np.testing.assert_allclose(slow(population[:2], KEY), scores[:2], atol=2e-4)

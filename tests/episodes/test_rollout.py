@@ -279,6 +279,7 @@ def test_gradient_through_a_rollout_of_a_jointed_body():
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("engine", "first"),
     [("population", "float32"), ("population", "float64"), ("mjx", "float64")],

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import body
+from laboratory import _ELBOW, body, read
 from mjx_revolve import InputError, make_fitness, make_mixed_fitness
 from mjx_revolve.body.edits import add_module
 from mjx_revolve.engine.plant import body_geometry
@@ -91,8 +91,9 @@ def test_the_beds_force_on_a_body_at_rest_is_what_the_water_leaves_of_its_weight
 @pytest.mark.slow
 def test_joints_are_recorded_for_one_body_and_for_many(settings, tmp_path):
     """Held at their offsets, in the robot's own order, whatever the engine's."""
-    body("snake").save(tmp_path / "snake.yaml")
-    config = settings("bending", morphology=str(tmp_path / "snake.yaml"))
+    elbow = read(_ELBOW)
+    elbow.save(tmp_path / "elbow.yaml")
+    config = settings("bending", morphology=str(tmp_path / "elbow.yaml"))
     one = make_fitness(config)
     names = list(one.controller.gene_names)
     genes = np.zeros((1, one.num_genes), np.float32)
@@ -100,8 +101,8 @@ def test_joints_are_recorded_for_one_body_and_for_many(settings, tmp_path):
     expected = one.robot.num_hinges * 0.5 * np.pi / 4 * np.sin(0.3)
     found = float(one(genes, KEY)[0])
     assert found == pytest.approx(expected, rel=0.05)
-    many = make_mixed_fitness(config, [body("snake"), body("core")])
-    robots = [many.build(body("core")), many.build(body("snake"))]
+    many = make_mixed_fitness(config, [elbow, body("core")])
+    robots = [many.build(body("core")), many.build(elbow)]
     wide = jnp.concatenate([jnp.zeros((1, many.num_genes)), many.pad_genes(genes, robots[1])])
     assert np.asarray(many(robots, wide, KEY)) == pytest.approx([0.0, found], abs=1e-4)
 

@@ -1,5 +1,7 @@
 """Slopes by genes through sensors, networks, servos and water, whole episodes and windows."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -59,23 +61,32 @@ def check_gradient(value, genes, gradient, count=6):
         assert gradient @ way == pytest.approx((ahead - behind) / 2e-6, rel=1e-4, abs=1e-4 * size)
 
 
-def mean_gain(windows, episodes):
-    """Genes → the mean gain of a window, for differences."""
-    return lambda genes: np.mean(windows.step(genes[None], episodes)[0].gain)
+@pytest.fixture(scope="module")
+def whole(settings):
+    """Makes windows of all of 0.4 s for a brain; two individuals share a program."""
+    return cache(
+        lambda kind: make_windows(make_fitness(listening(settings, kind), **{"task.duration": 0.4}))
+    )
+
+
+def mean_gain(windows, episodes, other):
+    """Genes → the mean gain of a window beside another individual, for differences."""
+    return lambda genes: np.mean(windows.step(jnp.stack([genes, other]), episodes)[0].gain[0])
 
 
 @pytest.mark.slow
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", BRAINS)
-def test_closed_loop_gradients_are_those_of_differences(settings, kind):
+def test_closed_loop_gradients_are_those_of_differences(whole, kind):
     """Through sensors with noise, brain, servos and water, in float64, over 0.4 s."""
     with jax.enable_x64(True):
-        fitness = make_fitness(listening(settings, kind), **{"task.duration": 0.4})
-        windows, genes = make_windows(fitness), drawn(1, fitness.num_genes)
+        windows = whole(kind)
+        genes = drawn(2, windows.fitness.num_genes)
         episodes = windows.init(genes, KEY)
         gradients, _ = windows.step(genes, episodes)
-        gradient = np.asarray(gradients.gradient).mean((0, 1))
-        check_gradient(mean_gain(windows, episodes), np.asarray(genes[0]), gradient)
+        gradient = np.asarray(gradients.gradient).mean(1)[0]
+        value = mean_gain(windows, episodes, genes[1])
+        check_gradient(value, np.asarray(genes[0]), gradient)
 
 
 @pytest.fixture(scope="module")
@@ -120,16 +131,14 @@ def test_windows_carried_on_are_one_long_rollout(brain, windows):
             windows.step(genes, episodes)
         new = genes[::-1]
         gradient = np.asarray(windows.step(new, before)[0].gradient).mean(1)[0]
-
-        def value(own):
-            return np.mean(windows.step(jnp.stack([own, new[1]]), before)[0].gain[0])
-
+        value = mean_gain(windows, before, new[1])
         check_gradient(value, np.asarray(new[0]), gradient, 3)
 
 
 @pytest.mark.slow
-def test_what_blows_up_has_no_gradient_and_spreads_none(windows):
+def test_what_blows_up_has_no_gradient_and_spreads_none(whole):
     with jax.enable_x64(True):
+        windows = whole("mlp")
         genes = drawn(2, windows.fitness.num_genes)
         broken = genes.at[1].set(jnp.nan)
         (one, _), (other, _) = (windows.step(x, windows.init(x, KEY)) for x in (genes, broken))
