@@ -20,7 +20,6 @@ from urllib.parse import unquote
 import pytest
 
 import mjx_revolve
-from browser import Browser, needs_browser
 from laboratory import ROOT
 from mjx_revolve.inputs.packages import REQUIREMENTS
 
@@ -399,21 +398,6 @@ def test_every_link_leads_somewhere(site):
     assert '<a href="physics.html"><code>docs/physics.md</code></a>' in (
         (site / "index.html").read_text()
     )
-
-
-@pytest.mark.slow
-@needs_browser
-def test_every_page_opens_without_an_error_and_fetches_nothing(site):
-    with Browser() as browser:
-        for path in sorted(site.rglob("*.html")):
-            if path.parent.name == "gallery":
-                browser.open(path)
-            else:
-                browser.send("Page.navigate", url=path.as_uri())
-                browser.wait("document.readyState === 'complete'")
-            assert browser.errors == [], path.name
-            assert browser.fact("error") is None, path.name
-        assert all(address.startswith("file:") for address in browser.requests)
 
 
 def test_messages_name_what_can_be_installed():

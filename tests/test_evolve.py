@@ -3,16 +3,11 @@
 Bits are compared within one process or on one machine with the same thread settings, as promised.
 """
 
-import datetime
 import errno
 import json
 import re
 import shutil
 import struct
-import sys
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -99,18 +94,6 @@ def test_what_died_before_its_first_checkpoint_stays_the_same_run(folder, capsys
     (folder / "run" / "metrics.csv").unlink()
     assert run_main("toy.yaml", "--out", "run") == 0
     assert path.read_text() == text
-
-
-def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(folder, monkeypatch):
-    """Four at once; the second is held still, as it would pass too soon."""
-    moment = datetime.datetime(2026, 1, 2, 3, 4, 5)
-    clock = SimpleNamespace(datetime=SimpleNamespace(now=lambda: moment))
-    monkeypatch.setattr(beginning, "datetime", clock)
-    config = SimpleNamespace(name="toy")
-    with ThreadPoolExecutor(4) as threads:
-        found = list(threads.map(lambda _: beginning._claim_folder(config), range(4)))
-    tail = ("", "-2", "-3", "-4")
-    assert sorted(found) == [Path("runs", f"toy-20260102-030405{end}") for end in tail]
 
 
 @pytest.mark.slow
@@ -294,13 +277,3 @@ def test_tensorboard_has_what_the_metrics_have(folder):
             assert [step for step, _ in points] == list(range(1, 8))
             assert np.allclose([value for _, value in points], column, rtol=1e-6)
     assert contents(folder / "part") == contents(folder / "whole")
-
-
-@pytest.mark.parametrize("argv", [("toy.yaml", "--out", "new"), ("--resume", "run")])
-def test_tensorboard_is_missed_before_anything_begins(stopped, argv, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    assert run_main(*argv, "--set", "evolution.tensorboard=true") == 2
-    err = capsys.readouterr().err
-    assert "evolution.tensorboard: expected the package tensorboardX; found none (pip" in err
-    assert err.count("\n") == 1
-    assert not (stopped / "new").exists()

@@ -17,13 +17,11 @@ from experiments import (
 )
 from experiments.falling_spider import (
     GAZEBO_GRAVITY,
-    TICK,
     closed_form,
     fit,
     load_thesis,
     mean_acceleration,
     read_run,
-    row_ticks,
 )
 from laboratory import ROOT
 from mjx_revolve.inputs.commands import run_command
@@ -63,19 +61,6 @@ def test_a_parabola_gives_its_own_acceleration_back():
     assert rms < 1e-12
     heights = -0.5 * 0.7 * time**2
     assert mean_acceleration(heights, len(heights) - 2) == pytest.approx(0.7)
-
-
-def test_ticks_are_found_in_uneven_rows():
-    form = closed_form("water", 9.8, SHARE)
-    ticks = np.random.default_rng(0).choice([99, 100, 101, 102], 60)
-    time = 0.8 + TICK * np.concatenate([[0], np.cumsum(ticks)])
-    found, misfit = row_ticks(form.height(time), form)
-    np.testing.assert_array_equal(found, ticks)
-    assert misfit < 1e-8
-    reading = read_run(form.height(time), form)
-    assert reading.timed == pytest.approx(form.wet, rel=1e-9)
-    assert reading.drop == pytest.approx(0.25, rel=1e-9)
-    np.testing.assert_allclose(reading.time, time, atol=1e-9)
 
 
 def test_the_thesis_data_read_with_its_errata(readings):
@@ -159,15 +144,6 @@ def test_each_library_maximises(name):
     optimisers.OPTIMISERS[name](counter, 5, 20, 40)
     assert counter.evaluations == 20 * 40
     assert counter.best_score > -0.02
-
-
-def test_a_step_along_the_gradient_never_lowers_the_score():
-    """The longest that pays, of steps that are halved; none where none pays."""
-    hill = lambda step: 1.0 - (step - 0.02) ** 2  # noqa: E731
-    step, after = optimisers.line_search(hill, hill(0.0))
-    assert step == pytest.approx(0.025) and after == hill(step) > hill(0.0)
-    assert optimisers.line_search(lambda step: -step, 0.0) == (0.0, 0.0)
-    assert optimisers.line_search(lambda step: float("nan"), 0.5) == (0.0, 0.5)
 
 
 def test_the_quick_validation_passes_and_keeps_its_table(tmp_path, monkeypatch, capsys):

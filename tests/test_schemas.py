@@ -61,18 +61,6 @@ def test_wrong_files_do_not_fit(kind, data, schemas):
     assert problems(schemas[kind], data)
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        {"bed": -2, "waves": {"amplitude": 0.02, "wavelength": 2.0}, "drag": False, "gust": "off"},
-        {"gravity": [0, 0, -9.81], "current_field": "x.npz", "surface_tension": True},
-        {"gust": {"std": 0.1}, "bed": "off"},
-    ],
-)
-def test_short_forms_fit(data, schemas):
-    assert problems(schemas["world"], data) == []
-
-
 def test_completion_has_the_shipped_names():
     script = make_script("bash")
     assert "lake_swim" in script and "spider" in script and "schema completion" in script

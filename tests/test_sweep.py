@@ -13,9 +13,7 @@ import pytest
 import toys
 from mjx_revolve import evolve, report, sweep
 from mjx_revolve.evolution.run_folder import RunFolder
-from mjx_revolve.evolution.sweeps import Sweep
 from mjx_revolve.inputs.commands import run_command
-from mjx_revolve.view.report.sweep import case_words
 from mjx_revolve.view.statistics import interval
 from toys import DroppedError, contents, dropping, make_toy
 
@@ -106,15 +104,6 @@ def test_a_sweep_is_a_grid_of_ordinary_runs_with_one_report(folder, no_pictures,
     assert run_command(report.main, ["out", "alone"]) == 2
 
 
-def test_cases_have_names_to_read():
-    grid = Sweep("a.yaml", 2, ("bodies.modules=[ActiveHinge],[FixedBrick,ActiveHinge]",
-                               "morphology=m/spider.yaml,gecko"))  # fmt: skip
-    assert [case_words(grid, case) for case in grid.cases] == [
-        "modules ActiveHinge; spider", "modules ActiveHinge; gecko",
-        "modules FixedBrick, ActiveHinge; spider", "modules FixedBrick, ActiveHinge; gecko",
-    ]  # fmt: skip
-
-
 @pytest.mark.slow
 def test_wherever_a_sweep_is_dropped_it_ends_in_the_same_bits(folder, no_pictures, capsys):
     assert run_sweep(*GRID, "--out", "whole") == 0
@@ -177,38 +166,3 @@ def test_what_is_wrong_is_said_in_one_line_before_anything_is_written(
     assert captured.err.count("\n") == 1
     assert message in captured.err.replace(f"{folder}/", "")
     assert not [*folder.glob("out/*/*/run.json")]
-
-
-def test_a_folder_of_something_else_is_refused(folder, no_pictures, capsys):
-    (folder / "out").mkdir()
-    (folder / "out" / "thesis.txt").write_text("years of work")
-    assert run_sweep(*GRID) == 2
-    assert "expected a new or empty folder, or that of a sweep" in capsys.readouterr().err
-    one = ("toy.yaml", "--seeds", "1", "--out", "sweep")
-    assert run_sweep(*one) == 0
-    capsys.readouterr()
-    # Another sweep into the same folder, fewer generations, and a page of somebody else's.
-    assert run_sweep(*one, "--set", "task.duration=9") == 2
-    assert "task.duration: expected 10.0 as in the run; found 9.0" in capsys.readouterr().err
-    assert run_sweep(*one, "--set", "evolution.generations=4") == 2
-    assert "expected a run of 4 generations at most; found 5" in capsys.readouterr().err
-    (folder / "sweep" / "report.html").write_text("<p>my homepage")
-    assert run_sweep(*one) == 2
-    assert "expected no file or an earlier report" in capsys.readouterr().err
-    assert (folder / "sweep" / "report.html").read_text() == "<p>my homepage"
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("[]", "sweep.yaml: expected a mapping with config, seeds; found []"),
-        ("{config: a, seeds: 1, settings: []}", "out: expected runs that are finished; found none"),
-    ],
-)
-def test_what_is_no_sweep_has_no_report(text, message, folder, capsys):
-    (folder / "out").mkdir()
-    (folder / "out" / "sweep.yaml").write_text(text)
-    assert run_command(report.main, ["out"]) == 2
-    captured = capsys.readouterr()
-    assert message in captured.err
-    assert captured.err.count("\n") == 1

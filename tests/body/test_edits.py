@@ -181,10 +181,6 @@ REFUSED = {
         lambda: add_module(SMALL, "core", 1, "FixedBrick"),
         "small: core: expected a free slot; found slot 1 taken by 'arm'",
     ),
-    "unknown slot": (
-        lambda: add_module(SMALL, "arm", 0, "FixedBrick"),
-        "small: arm: expected one of the slots 1, 2, 3 of type FixedBrick (slot 0 is where it",
-    ),
     "no slots": (
         lambda: add_module(SMALL, "toe", 1, "FixedBrick"),
         "small: toe: expected none, since type TouchSensor has no slots; found 1",
@@ -192,22 +188,6 @@ REFUSED = {
     "core": (
         lambda: remove_module(SMALL, 0),
         "small: core: expected a module that is attached to another one; found the core",
-    ),
-    "type": (
-        lambda: add_module(SMALL, 0, 2, "Bric"),
-        "small: core.children.2.type: expected one of ActiveHinge, Fin, FixedBrick, FixedBrick",
-    ),
-    "core retyped": (
-        lambda: replace_module(SMALL, 0, "FixedBrick"),
-        "small: core.type: expected one of BlueROV2, Core, CoreComponent (the root is a core); ",
-    ),
-    "angle": (
-        lambda: turn_module(SMALL, "hip", 45),
-        "small: hip.orientation: expected 0, 90, 180, 270 or -90 [deg]; found 45",
-    ),
-    "params": (
-        lambda: add_module(SMALL, 0, 2, "Fin", params={"mass": -1}),
-        "small: core.children.2.params.mass: expected a number >= 0 [kg]; found -1",
     ),
     "nested": (
         lambda: swap_subtrees(SMALL, "toe", "hip"),
@@ -280,29 +260,3 @@ def test_random_edits_make_valid_bodies_or_say_why_not(seed, name):
     assert done > 15
     saved = yaml.safe_load(yaml.safe_dump(body.to_mapping(), sort_keys=False))
     assert make_morphology(saved) == body
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_what_an_edit_does_another_one_undoes(seed):
-    draw = np.random.default_rng(seed)
-    body = [OURS["spider"], OURS["centipede"], OURS["gecko"], SMALL][seed % 4]
-    body = make_morphology(in_order(body.to_mapping()["body"]))
-    for _ in range(15):
-        index = int(draw.integers(1, body.num_modules))
-        module = body.modules[index]
-        parent = body.modules[module.parent].name
-        kind, turn = str(draw.choice(TYPES)), int(draw.choice([0, 90, 180, 270]))
-        without = remove_module(body, index)
-        assert graft_subtree(without, parent, module.slot, body, index) == body
-        try:
-            turned = turn_module(body, index, turn)
-        except InputError:
-            turned = body
-        assert turn_module(turned, index, module.orientation) == body
-        slots = free_slots(body)
-        above, slot = slots[draw.integers(len(slots))]
-        try:
-            grown = add_module(body, above, slot, kind, turn, name="new")
-        except InputError:
-            continue
-        assert remove_module(grown, "new") == body

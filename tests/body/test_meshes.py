@@ -244,18 +244,6 @@ def test_module_meshes_have_the_tabulated_volume_and_outer_size(kind, part):
         assert mesh.bounds[1, 0] > high[0]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "part"), PARTS, ids=PART_NAMES)
-@pytest.mark.parametrize("share", [0.02, 0.9, 1.5])
-def test_types_of_users_are_drawn_with_their_volume(kind, part, share):
-    full = float(sum(np.prod(one.size) for one in part.boxes))
-    own = replace(part, volume=share * full)
-    for name in (kind.name, "MyOwn"):
-        mesh = part_mesh(replace(kind, name=name), own)
-        check_mesh(mesh, name)
-        assert mesh_volume(mesh) == pytest.approx(own.volume, rel=1e-6)
-
-
 def test_a_shell_has_the_volume_of_walls_less_windows():
     """The brick against pencil and paper: outer box - inner box - window polygons x wall."""
     kind = MODULES["FixedBrick"]

@@ -242,36 +242,6 @@ def test_in_a_batch_of_different_bodies_they_feel_the_same(robot, spiders):
         capacity.plant.site("at back_foot")
 
 
-@pytest.mark.slow
-def test_sensors_on_modules_reach_the_observation(robot, spiders):
-    before, after, ctrl, sensors = spiders
-    declared = [
-        Sensor(type="flow", at="back_foot", range=100),
-        Sensor(type="accelerometer", at="left_knee", range=100),
-        Sensor(type="angle", at="left_knee", range=100),
-        Sensor(type="depth", each="FixedBrick", range=100),
-    ]
-    plant = make_engine(robot).plant
-    observer = make_observer(declared, DT, plant)
-    assert observer.signals == ("at back_foot", "at left_knee", "forces", "each FixedBrick")
-    assert observer.robot_names == (
-        "back_foot flow x", "back_foot flow y", "back_foot flow z", "left_knee accelerometer x",
-        "left_knee accelerometer y", "left_knee accelerometer z", "left_knee angle",
-        "FixedBrick depth",
-    )  # fmt: skip
-    assert observer.joint_names == ("FixedBrick depth",)
-    sense, source = felt(lambda: make_engine(robot), before, after, ctrl)
-    _, told = observer.observe((), jnp.zeros(()), sense, source[:8])
-    robots = 100 * np.stack(told.robot)
-    assert pytest.approx(expected(sensors, "back_foot")["flow"], abs=1e-4) == robots[:3].T
-    assert pytest.approx(sensors["left_knee", "accelerometer"], abs=0.02) == robots[3:6].T
-    assert robots[6] == pytest.approx(sensors["left_knee", "jointpos"][:, 0], abs=1e-5)
-    assert not robots[7].any()  # there is no brick on the core's rigid body
-    row = int(np.flatnonzero(source[:8, 0] == 1)[0])
-    wanted = -expected(sensors, "back_foot")["height"]
-    assert 100 * np.asarray(told.joint[0])[row] == pytest.approx(wanted, abs=1e-4)
-
-
 PADS = """
 id: padded
 body:

@@ -21,7 +21,6 @@ from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.population import PopulationEngine
-from mjx_revolve.engine.state import RootState
 from mjx_revolve.water.flow import water_of
 
 LANES = 3
@@ -230,17 +229,3 @@ def test_touch_is_the_beds_force_on_each_body(robot):
         bed, _ = jax.jit(push, compiler_options=QUICK)(jnp.asarray(qpos), jnp.asarray(qvel))
     # Nothing moves, so that no force has friction: all of them point up.
     assert found.touch.sum(0) == pytest.approx(np.asarray(bed[2]), rel=1e-9)
-
-
-def test_work_adds_up():
-    root = RootState(*(4 * (jnp.zeros(1),),) * 4)
-    memory = init_memory(("work",), *_toy())
-    for _ in range(3):
-        memory = update_memory(memory, root, root, jnp.zeros((0, 1)), jnp.array([2.0]), 0.1)
-    assert memory.work == pytest.approx(6.0)
-    assert memory.acceleration is None and memory.ctrl is None
-
-
-def _toy():
-    engine = make_engine(box_robot((0.1, 0.1, 0.1), 1.0, world()))
-    return engine, engine.init(jnp.zeros((7, 1)).at[3].set(1.0), jnp.zeros((6, 1)))

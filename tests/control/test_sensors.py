@@ -1,22 +1,15 @@
 """Declared sensors: noise, range, rate and delay by hand; and how they are read."""
 
-import re
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import yaml
 
-from laboratory import OAR, ROOT, read, world
-from mjx_revolve.body.morphology import load_morphology, make_morphology
+from laboratory import OAR, ROOT, read
+from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.body.sensors import SENSORS, Sensor, SensorRow
-from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.control.sensors import make_observer
-from mjx_revolve.engine.plant import plant_of
-from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.episodes.config import ControllerConfig
 from mjx_revolve.inputs import schema
 from mjx_revolve.inputs.errors import InputError
 
@@ -170,18 +163,3 @@ def test_the_guides_table_of_sensors_is_the_codes():
             f"| `{name}` | {len(kind.parts)} | {kind.unit} | {kind.where} | {reach} | {kind.what} |"
         )
         assert row in GUIDE
-
-
-def test_the_guides_examples_are_read():
-    sensed, placed, thinker = (
-        yaml.safe_load(x) for x in re.findall(r"```yaml\n(.*?)```", GUIDE, re.DOTALL)
-    )
-    settings = ControllerConfig(**sensed["controller"])
-    plant = plant_of(build_robot(read(OAR), world()))
-    assert find_controller(plant, settings).num_genes > 0
-    body = make_morphology(thinker)
-    plant = plant_of(build_robot(body, world()))
-    network = find_controller(plant, ControllerConfig(type="brain"), body=body)
-    assert network.num_genes == 2 + 3 + 2
-    sensors = schema.read(SensorRow, placed["sensors"], "sensors")
-    assert len(make_observer(sensors, DT, plant).robot_names) == 3 + 3 + 2 + 3

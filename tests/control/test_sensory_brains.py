@@ -237,16 +237,3 @@ def test_splines_go_through_their_points():
             np.arange(points + 1) / points, [*through, through[0]], bc_type="periodic"
         )
         assert found == pytest.approx(REACH * curve((DT * np.arange(200, 600)) % 1), abs=1e-9)
-
-
-def test_a_splines_gait():
-    """Of a curve through samples of a sine: nearly that sine."""
-    robot = elbow_robot(world())
-    plant = plant_of(robot)
-    phase = np.array([0.3, 1.1])
-    values = 0.5 * np.sin(2 * np.pi * np.arange(8)[:, None] / 8 + phase)
-    genes = np.concatenate([np.arcsin(values).ravel(), [0.0]])
-    found = describe_gait(plant, ControllerConfig(type="splines"), genes)
-    assert found["mean_period"] == pytest.approx(1.0)
-    assert found["mean_amplitude"] == pytest.approx(0.5 * REACH, rel=0.01)
-    assert found["mean_phase_offset"] == pytest.approx(0.7, abs=0.01)

@@ -22,7 +22,6 @@ from mjx_revolve.engine.interaction import (
 from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.spheres import pack_spheres, sphere_box
-from mjx_revolve.engine.state import State
 from mjx_revolve.episodes.rollout import Rollout, held
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.flow import water_of
@@ -319,38 +318,6 @@ def test_jointed_robots_meet_fast_and_lose_energy():
     change = np.linalg.norm(change - change[:, :1], axis=-1).max(1) / size
     assert change.max() < 0.02
     assert change[2] < 1e-3  # two spiders mirror each other, nearly
-
-
-@pytest.mark.slow
-def test_without_others_nothing_changes():
-    """A meeting of robots out of each other's reach leaves every bit as it is."""
-    space, _, capacity, tables, spheres = crowd_tables()
-    qpos, qvel = crowd(0)
-    qpos = qpos.at[0].add(3.0 * jnp.arange(8))
-
-    @partial(jax.jit, static_argnums=1, compiler_options=QUICK)
-    def run(packed, meet: bool):
-        tables, spheres = packed
-        rows = make_batched_trees(space, capacity, tables, 8)
-        meeting = (
-            make_interaction(rows, spheres, jnp.ones(8, bool), 1, ContactParameters())
-            if meet
-            else None
-        )
-        engine = PopulationEngine(rows, tables.plant, interaction=meeting)
-        state = engine.init(qpos, qvel)
-        assert isinstance(state, State)
-        pushes = (
-            (engine.interaction.detect(state, engine.interaction.init(state))[0].wrench,)
-            if meet
-            else ()
-        )
-        ctrl = jnp.zeros((tables.plant.num_rows, 8))
-        return engine.observe(engine.step(state, ctrl, water_of(space), *pushes)[0])
-
-    packed = tables, spheres
-    for a, b in zip(run(packed, True), run(packed, False), strict=True):
-        assert np.allclose(a, b, rtol=1e-13, atol=1e-13)
 
 
 def test_too_many_spheres_are_refused_by_name():

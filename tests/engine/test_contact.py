@@ -152,6 +152,14 @@ def test_a_core_lands_on_a_flat_bed_and_stays():
         assert np.diff(energy).max() < 0.05 * (start - energy[-1])
 
 
+@pytest.fixture(scope="module")
+def lake_core():
+    """A core dropped in the lake: on level ground, on a gentle slope and on a steep one."""
+    robot = sink(LAKE)
+    qpos, qvel = above(robot, [LEVEL, GENTLE, STEEP], 0.3)
+    return robot, *march(robot, 12.0, qpos, qvel, every=20)[1:3]
+
+
 def test_creep_stays_below_the_stated_speed(lake_core):
     """Where tan(slope) is half of μ, the docstring's 1 mm/s law creeps at .6 mm/s."""
     _, q, _ = lake_core

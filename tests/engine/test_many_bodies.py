@@ -411,7 +411,6 @@ def test_what_it_cannot_do_is_refused_by_name(config, fitness):
             lambda: make_mixed_fitness(config, [body("snake")], engine="mjx"),
             "engine: expected population, as bodies differ; found mjx",
         ),
-        (lambda: make_mixed_fitness(config, []), "examples: expected at least one morphology"),
         (
             lambda: fitness([fitness.build(body("snake"))], zeros, None),
             "robots: expected 2, one each; found 1",
@@ -419,14 +418,6 @@ def test_what_it_cannot_do_is_refused_by_name(config, fitness):
         (
             lambda: fitness([body("snake")], zeros[:1], None),
             "robots: expected what `build` returns; found Morphology",
-        ),
-        (
-            lambda: fitness([], np.zeros((2, 3)), None),
-            f"population: expected [P, {fitness.num_genes}] or [B, P, {fitness.num_genes}]; found",
-        ),
-        (
-            lambda: fitness([fitness.build(body("snake"))], np.stack([zeros, zeros]), None),
-            "robots: expected 2, one each; found 1",
         ),
     ]
     for make, message in cases:

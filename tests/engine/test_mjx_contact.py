@@ -208,16 +208,6 @@ def test_nothing_falls_through(wet):
         assert max(energy(a, b) for a, b in rows) < start
 
 
-@pytest.mark.slow
-def test_a_current_moves_it_where_friction_gives_way(wet):
-    """Drag at 0.2 m/s is a fifth of the grip, at 1 m/s five times as much."""
-    _, _, _, (_, q, v, _) = wet
-    assert np.abs(q[-1, :2, 5:7]).max() < 2e-3
-    assert np.abs(v[-1, :, 5:7]).max() < 1e-3
-    assert q[-1, 0, 7] > 0.5
-    assert 0.1 < v[-1, 0, 7] < 1.0
-
-
 @pytest.mark.long
 def test_jointed_without_water_it_is_mujocos_step():
     """An elbow tips onto its corners; its hinges are soft springs, without what is ours alone.

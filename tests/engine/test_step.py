@@ -191,22 +191,6 @@ def test_a_body_drifts_to_the_current(added_mass):
     assert np.linalg.norm(v[-1, :3, 0] - current) < 0.05
 
 
-def test_boxes_at_several_depths_see_several_currents():
-    """Linear shear: u₀ at the surface, half of it half way down, nothing below."""
-    shear = {"velocity": [0.4, -0.2, 0.0], "depth": 10.0}
-    robot = box_robot(CUBE, 1.0, world(drag="faces", added_mass=True, shear=shear))
-    qpos, qvel = at_rest(robot, 3)
-    qpos[2] = -1.0, -5.0, -12.0
-    time, q, v, _ = march(robot, 5.0, qpos, qvel, every=20)
-    inertia = 1.0 + RHO * robot.fluid.added_mass[0, 0]
-    drag = face_drag(robot).linear[0, 0]
-    for lane, share in enumerate((0.9, 0.5, 0.0)):
-        u = share * np.array([0.4, -0.2, 0.0])
-        expected = u - closing(u, drag, inertia, time[:, None])
-        assert v[:, :3, lane] == pytest.approx(expected, abs=0.005 * 0.4)
-    assert q[-1, 2] == pytest.approx(qpos[2], abs=1e-9)
-
-
 def test_a_floating_box_goes_with_a_long_wave():
     """Its height is the surface's where it is, its velocity the water's, its deck level with it."""
     amplitude, length = 0.2, 40.0
@@ -298,14 +282,6 @@ def test_switches_of_single_modules(switch):
     """Half out of the water at rest, and deep in it at speed."""
     check_switch(switch, -0.001, 0.0, ("population",))
     check_switch(switch, -2.0, -0.5, ("population",))
-
-
-@pytest.mark.slow
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("switch", ["added_mass", "buoyancy"])
-def test_switches_of_single_modules_in_mjx(switch):
-    """Both engines share the water; one switch of its forces and one of the inertia will do."""
-    check_switch(switch, -2.0, -0.5, ("population", "mjx"))
 
 
 def test_what_a_world_switches_off_stays_off():

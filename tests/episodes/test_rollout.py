@@ -4,7 +4,6 @@ import math
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
@@ -24,7 +23,6 @@ from mjx_revolve.body.morphology import trim_neutral
 from mjx_revolve.control.controller import bind_genes
 from mjx_revolve.control.cpg import make_cpg
 from mjx_revolve.control.feedback import make_feedback
-from mjx_revolve.engine.kinematics import body_poses
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.simulate import Trajectory, simulate
@@ -92,18 +90,6 @@ def test_shapes_and_time(elbow, still):
     assert still.qpos[0, 2] == pytest.approx(-1.0, abs=1e-3)
     assert still.qpos[-1, 2] < -1.001
     assert np.linalg.norm(still.qpos[:, 3:7], axis=1) == pytest.approx(1.0, abs=1e-6)
-
-
-@pytest.mark.parametrize("name", ["spider", "snake"])
-def test_body_poses_of_real_bodies(name):
-    robot = build_robot(body(name), world())
-    qpos = np.random.default_rng(1).normal(size=(5, robot.mj_model.nq)).astype(np.float32)
-    found = jax.jit(lambda q: body_poses(robot, q)[0])(qpos)
-    data = mujoco.MjData(robot.mj_model)
-    for row, places in zip(qpos, found, strict=True):
-        data.qpos[:] = row
-        mujoco.mj_kinematics(robot.mj_model, data)
-        assert places == pytest.approx(data.xpos, abs=1e-5)
 
 
 def test_all_forms_of_joint_targets(elbow, still):

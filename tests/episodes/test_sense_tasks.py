@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mjx_revolve import make_fitness
-from mjx_revolve.episodes.config import TaskConfig, load_config
+from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.tasks import TASKS, Track
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -136,19 +136,3 @@ def test_a_pursuer_is_the_robots_own(chased):
     start = np.asarray(one.starts(key)[0])[:3, 0]
     first = np.linalg.norm(place[0] - start)
     assert first == pytest.approx(0.4 - 0.3 * one.robot.world.timestep, abs=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("name", "task", "genes"),
-    [
-        # Per thruster a bias and its answers to each number, and a frequency that nobody has.
-        ("auv_follow_course", "follow_course", 1 + 4 * (1 + 3 + 3 + 3 + 1 + 1)),
-        ("auv_search", "search", 1 + 4 * (1 + 3 + 3 + 3 + 1 + 1)),
-        ("auv_escape", "escape", 1 + 4 * (1 + 3 + 1 + 3 + 3 + 1 + 1)),
-        ("auv_hold_heading", "hold_heading", 1 + 4 * (1 + 3 + 3 + 1 + 1 + 3)),
-    ],
-)
-def test_shipped_configurations(name, task, genes):
-    fitness = make_fitness(name)
-    assert fitness.config.task.type == task and fitness.num_genes == genes
-    assert load_config(ROOT / "configs" / f"{name}.yaml").task == fitness.config.task

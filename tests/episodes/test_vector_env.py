@@ -174,17 +174,6 @@ TASKS = {
         "task.target_speed": 0.1,
         "sensors": ["bearing", {"type": "gyro", "rate": 10.0, "delay": 0.1}, "load"],
     },
-    "escape": {
-        "task.target_distance": 0.3,
-        "task.target_speed": 0.2,
-        "task.target_turn": 1.0,
-        "sensors": ["bearing", "distance"],
-    },
-    "follow_course": {
-        "task.course_spread": 1.0,
-        "task.course_changes": 2,
-        "sensors": ["course"],
-    },
 }
 
 
@@ -219,17 +208,6 @@ def test_a_seed_says_everything(env, episode):
     assert np.array_equal(other[0, :-1], episode[0][0, 1:])
     given = env.reset(seed=[7, 3, 3, 6, 5])[0]
     assert np.array_equal(given[[1, 2, 3, 4]], episode[0][0][[0, 0, 3, 2]])
-
-
-@pytest.mark.slow
-def test_what_is_over_begins_anew_at_the_next_step(env, fitness, episode):
-    seen, rewards, _, over, _ = episode
-    assert np.all(rewards[STEPS + 1] == 0) and not over[STEPS + 1].any()
-    # Its first observation is that of the seed's next episode.
-    env.reset(seed=3)
-    assert np.array_equal(env.reset()[0], seen[STEPS + 1])
-    x, y = np.asarray(fitness.starts(jax.random.fold_in(jax.random.key(3), 1))[0])[4:6, 0]
-    assert seen[STEPS + 1, 0, 2] == pytest.approx(1 - 2 * (x * x + y * y), abs=1e-5)
 
 
 @pytest.mark.slow

@@ -13,7 +13,6 @@ from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.bodies_config import BrainsConfig
 from mjx_revolve.evolution.brains import gene_layout, make_brain_encoding
-from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.world import load_world
 
 SNAKE = body("snake")
@@ -41,7 +40,6 @@ def shorter():
 
 
 def test_places_of_genes():
-    """A hinge's genes stand where it turns; a pair's between its two hinges."""
     layout = layout_of(SNAKE, make_cpg)
     anchors = []
     for index in SNAKE.hinges:
@@ -91,7 +89,6 @@ def test_a_child_with_its_parents_body_has_its_genes():
 
 
 def test_a_joint_that_has_grown_does_as_the_nearest():
-    """A hinge more at the snake's end takes over what the last one had; the others keep theirs."""
     brains = make_brain_encoding(BrainsConfig(mutation=0.0), common())
     small = layout_of(shorter(), common=common())
     parent = brains.draw(np.random.default_rng(0), small)
@@ -116,7 +113,6 @@ def test_of_two_parents_the_first_ones_joints_come_first():
 
 
 def test_a_copy_does_as_its_original():
-    """Of a limb that was doubled; one that a second parent gave does as it did there."""
     brains = make_brain_encoding(BrainsConfig(mutation=0.0), common())
     bare = add_module(body("core"), 0, 0, "ActiveHinge", name="fin")
     bare = add_module(bare, 0, 1, "ActiveHinge", name="leg")
@@ -132,7 +128,6 @@ def test_a_copy_does_as_its_original():
 
 
 def test_the_network_by_hand():
-    """With one weight from x to the first kind of gene, those genes are x in units of .1 m."""
     brains, layout = make_brain_encoding(BrainsConfig(type="cppn"), common()), layout_of(SNAKE)
     weights = np.zeros(brains.size, np.float32)
     hidden, inputs = 12, 7
@@ -154,10 +149,3 @@ def test_the_network_by_hand():
     for gene, place, value in zip(layout.genes, layout.place, genes, strict=True):
         expected = np.sin(30 * place[1]) if gene.what == "u" else 0.0
         np.testing.assert_allclose(value, expected, rtol=1e-5, atol=1e-7)
-
-
-@pytest.mark.parametrize(("kind", "brain"), [("joints", [1.0]), ("joints", {"a": "b"}),
-                                            ("cppn", {}), ("cppn", [1.0, 2.0])])  # fmt: skip
-def test_damaged_brains(kind, brain):
-    with pytest.raises(InputError, match="brain: expected"):
-        make_brain_encoding(BrainsConfig(type=kind), common()).check(brain)

@@ -117,7 +117,6 @@ def test_workers_may_join_at_any_time(cluster, executor, caplog):
 
 
 def test_a_sweep_has_the_workers_of_a_cluster(cluster, executor, tmp_path, monkeypatch, capsys):
-    """The same bits as in this process, over several runs that share its workers."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("mjx_revolve.view.results.save_pictures", lambda start, champion: None)
     toys.write_config(tmp_path / "toy.yaml", population_size=8, generations=3)

@@ -20,7 +20,6 @@ from mjx_revolve.evolution.generations import run_generations
 from mjx_revolve.evolution.individuals import from_record, to_record
 from mjx_revolve.evolution.learning import learn, score_brains
 from mjx_revolve.inputs.commands import run_command
-from mjx_revolve.inputs.errors import InputError
 from toys import CLOCK, make_toy_bodies
 
 
@@ -83,7 +82,6 @@ def test_learning_does_not_depend_on_the_other_bodies(folder):
 
 
 def test_learning_improves_and_is_what_counts(folder):
-    """One trial is the brain of birth; more find better ones, and the score is the best one's."""
     config, executor = start(folder)
     born, key = founders(config, executor), jax.random.key(0)
     naive = learn(executor, born, key)
@@ -160,7 +158,6 @@ SCHEMES = [
 @pytest.mark.slow
 @pytest.mark.parametrize("selection", SCHEMES, ids=lambda s: s["type"])
 def test_generations(folder, selection):
-    """The bookkeeping of all schemes, and that the same seed gives the same bits."""
     config, executor = start(folder, {"selection": selection})
     search, rows = run(config, executor)
     per = selection.get("offspring", 6)
@@ -186,7 +183,6 @@ def test_generations(folder, selection):
 
 @pytest.mark.slow
 def test_evolution_finds_the_optimum(folder):
-    """Three hinges, and genes near a half: far above what random search finds."""
     found = {}
     for kind in ("plus", "random"):
         bodies = {"selection": {"type": kind}, "brains": {"mutation": 0.1}}
@@ -201,7 +197,6 @@ def test_evolution_finds_the_optimum(folder):
 
 @pytest.mark.slow
 def test_inheritance(folder):
-    """Children begin with what their parents learnt, were born with, or with nothing of either."""
     learning = {"population_size": 8, "generations": 4, "std_init": 0.5}
     for how in ("lamarckian", "darwinian", "none"):
         brains = {"inheritance": how, "mutation": 0.0}
@@ -241,19 +236,6 @@ def test_seeds_begin_the_population(folder):
     for individual, seed in zip(first, executor.fitness.seeds, strict=False):
         assert individual.body.modules == seed.modules
     assert first[2].body.modules != first[0].body.modules
-
-
-@pytest.mark.parametrize(("bodies", "message"), [
-({"seeds": ["snake"]}, r"snake.yaml: expected 2 to 8 modules; found"),
-({"params": {"nope": 1}}, "bodies.params.nope"),
-({"learning": {"generations": 2}}, "bodies.learning.population_size: expected at least 2"),
-({"selection": {"type": "nsga2", "objectives": ["score", "sped"]}}, "objectives: expected"),
-({"archive": {"axes": {"num_hinges": {"low": 0, "high": 4}, "x": {"low": 0, "high": 1}}}},
-     "archive.axes: expected")
-])  # fmt: skip
-def test_wrong_settings(folder, bodies, message):
-    with pytest.raises(InputError, match=message):
-        BodyEvolution(*start(folder, bodies))
 
 
 ARCHIVE = {
@@ -336,7 +318,6 @@ def test_what_is_in_a_run_folder(folder, capsys):
 
 @pytest.mark.slow
 def test_workers_change_nothing(folder, no_pictures):
-    """The same bits from this process and from two others."""
     toys.write_bodies_config(folder / "toy.yaml", {"learning": {"population_size": 6}})
     assert main("toy.yaml", "--out", "one", "--set", "evolution.generations=2") == 0
     argv = ("toy.yaml", "--out", "two", "--workers", "2", "--set", "evolution.generations=2")

@@ -23,15 +23,12 @@ from mjx_revolve.episodes.config import load_config
 from mjx_revolve.evolution import failed_blocks as lost
 from mjx_revolve.evolution import jobs
 from mjx_revolve.evolution import run_folder as runs
-from mjx_revolve.evolution.blocks import block_size, evaluate_block, split_blocks
+from mjx_revolve.evolution.blocks import split_blocks
 from mjx_revolve.evolution.executor import Executor, make_executor
-from mjx_revolve.evolution.failed_blocks import save_failed_block, score_failed_block
 from mjx_revolve.evolution.gene_search import GeneEvolution
 from mjx_revolve.evolution.generations import run_generations
 from mjx_revolve.evolution.jobs import Limits, WorkerError, make_job, open_job
 from mjx_revolve.inputs.commands import run_command
-from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.inputs.trust import UntrustedError
 from mjx_revolve.numerics import runtime
 from mjx_revolve.water.world import load_world
 from toys import contents, wait_for
@@ -98,11 +95,6 @@ def test_blocks_have_one_shape_and_are_padded_with_their_first_row(size):
     assert all((row == blocks[-1][0]).all() for row in np.concatenate(blocks)[size:])
 
 
-@pytest.mark.parametrize(("trials", "size"), [(1, 64), (3, 21), (64, 1), (100, 1)])
-def test_a_block_fills_a_chunk_of_lanes(trials, size):
-    assert block_size(trials) == size
-
-
 def test_without_workers_or_blocks_a_pool_is_its_fitness():
     fitness = toys.Toy()
     population = np.random.default_rng(0).normal(size=(9, 5)).astype(np.float32)
@@ -156,21 +148,6 @@ def test_the_champion_does_not_depend_on_blocks(crowd):
     assert champions[0].origin == champions[1].origin
 
 
-def test_each_worker_has_a_core_of_its_own(crowd):
-    _, executor = crowd
-    if not hasattr(os, "sched_getaffinity"):
-        pytest.skip("this system does not pin processes")
-    cores = sorted(os.sched_getaffinity(0))
-    if len(cores) > 3:
-        pytest.skip("fewer workers than cores are not pinned")
-    processes = [worker.process for worker in executor.workers]
-    expected = [{cores[i % len(cores)]} for i in range(3)]
-    wait_for(lambda: [os.sched_getaffinity(p.pid) for p in processes] == expected)
-    for process, core in zip(processes, expected, strict=True):
-        threads = [int(name) for name in os.listdir(f"/proc/{process.pid}/task")]
-        assert all(os.sched_getaffinity(thread) == core for thread in threads)
-
-
 def test_workers_ignore_interrupts(crowd):
     _, executor = crowd
     for worker in executor.workers:
@@ -182,7 +159,6 @@ def test_workers_ignore_interrupts(crowd):
 
 
 def test_a_job_takes_all_files_along(tmp_path):
-    """So that workers elsewhere, and those that replace others, see what the run began with."""
     (tmp_path / "sea.yaml").write_text("current_field: river.csv\n")
     (tmp_path / "river.csv").write_text("x,y,z,u,v,w\n0,0,0,1,0,0\n")
     (tmp_path / "grid.bin").write_bytes(b"grid")
@@ -348,23 +324,8 @@ def test_a_strangers_block_runs_nothing(tmp_path, monkeypatch, capsys):
     assert not Path("was run").exists()
 
 
-def test_a_lost_block_of_bodies_can_be_scored_again(tmp_path):
-    config = load_config(toys.write_bodies_config(tmp_path / "bodies.yaml"))
-    fitness = toys.make_toy_bodies(config)
-    rng = np.random.default_rng(0)
-    bodies = [fitness.genotype.develop(fitness.genotype.random(rng)) for _ in range(3)]
-    genes = rng.normal(size=(8, fitness.num_genes)).astype(np.float32)
-    block = (genes, np.array([0, 1, 2, 0, 1, 2, 0, 0], np.int32), bodies)
-    path = save_failed_block(tmp_path / "lost", make_job(config, toys.make_toy_bodies), block, KEY)
-    scores, _ = score_failed_block(path, trust=True)
-    assert scores.tobytes() == evaluate_block(fitness, block, KEY)[0].tobytes()
-    with pytest.raises(UntrustedError, match=r"make: expected .*; found 'toys:make_toy_bodies'"):
-        score_failed_block(path)
-
-
 @pytest.mark.slow
 def test_a_run_goes_on_when_workers_are_killed(folder, capsys, monkeypatch):
-    """At any moment; the same bits as in this process alone."""
     monkeypatch.setenv("TOY_TROUBLE", str(folder / "order"))
     more = ("--set", "evolution.generations=40")
     others = {*workers_of(os.getpid())}
@@ -412,7 +373,6 @@ def test_workers_that_cannot_be_built(folder, capsys, monkeypatch):
 
 @pytest.mark.slow
 def test_workers_of_another_program_score_nothing(tmp_path, caplog):
-    """As when somebody edits the package or the world's file while the run goes on."""
     with make_executor(toy_config(tmp_path), 2, toys.make_toy) as executor:
         executor.identity |= {"mjx_revolve": "abc"}
         found = r"mjx_revolve: expected abc as the run has it; found \w+"
@@ -480,13 +440,6 @@ def test_workers_do_not_outlive_their_leader(folder):
     wait_for(lambda: not any(map(is_alive, workers)))
 
 
-def test_an_accelerator_takes_the_whole_population(tmp_path, monkeypatch):
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert block_size(1) is None
-    with pytest.raises(InputError, match="--workers: expected JAX to run on the CPU"):
-        make_executor(toy_config(tmp_path), 2, toys.make_toy)
-
-
 ROBOT = """
 id: knee
 body:
@@ -499,7 +452,6 @@ body:
 
 @pytest.mark.slow
 def test_a_robot_does_not_depend_on_its_workers(tmp_path, monkeypatch):
-    """10 individuals of 16 episodes: three blocks of 4, the last of which is padded."""
     (tmp_path / "cache").mkdir()
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
     path = toys.write_config(tmp_path / "knee.yaml", population_size=10)

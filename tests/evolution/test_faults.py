@@ -12,7 +12,6 @@ import pytest
 import toys
 from laboratory import ROOT, XLA_FLAGS
 from mjx_revolve import evolve
-from mjx_revolve.episodes.config import load_config
 from mjx_revolve.evolution import memory
 from mjx_revolve.inputs.commands import run_command
 
@@ -133,41 +132,6 @@ def test_the_largest_population_fits(tmp_path, folder, monkeypatch):
             else:
                 with pytest.raises(ValueError, match=f"at most {most},"):
                     memory.check_memory(config_of(strategy, most + 1), 5)
-
-
-@pytest.mark.slow
-def test_bodies_beyond_the_memory_are_refused_beforehand(folder, capsys, monkeypatch):
-    toys.write_bodies_config(folder / "bodies.yaml")
-
-    def run(*settings):
-        argv = ["bodies.yaml", "--out", "run", *(x for s in settings for x in ("--set", s))]
-        return run_command(lambda argv: evolve.main(argv, toys.make_toy_bodies), argv)
-
-    for settings, place in (
-        (["evolution.population_size=1000000000"], "evolution.population_size"),
-        (["bodies.selection.offspring=1000000000"], "bodies.selection.offspring"),
-    ):
-        assert run(*settings) == 2
-        err = capsys.readouterr().err
-        assert f"--set {place}: expected at most " in err
-        assert err.endswith(" GB of memory are free; found 1000000000\n")
-        assert not os.path.exists("run")
-
-    fitness = toys.make_toy_bodies(load_config("bodies.yaml"))
-    assert 2_000 < memory.weigh_bodies(fitness.genotype) < 100_000
-    monkeypatch.setattr(memory, "free_memory", lambda: 10_000_000)
-
-    def check(size):
-        config = load_config("bodies.yaml", {"evolution.population_size": size})
-        memory.check_memory(config, fitness.num_genes, fitness.genotype)
-
-    with pytest.raises(ValueError, match="expected at most") as caught:
-        check(10**9)
-    most = int(str(caught.value).split("at most ")[1].split(",")[0])
-    assert 100 < most < 2000
-    check(most - most // 10)  # what is weighed depends a little on what was made before
-    with pytest.raises(ValueError, match="expected at most"):
-        check(most + most // 10)
 
 
 def config_of(strategy, size):

@@ -54,15 +54,6 @@ def test_a_log_has_sixty_lines_at_most(total, stride, clock):
     assert told == sorted({0, 1, total, *middle})
 
 
-def test_a_log_is_never_silent_for_long(clock):
-    out = io.StringIO()
-    shown = progress.Progress(0, 500, out)
-    for generation in range(1, 6):
-        shown.show(row(generation))
-        clock[0] += 31.0
-    assert len(out.getvalue().splitlines()) == 6
-
-
 def test_plain_lines_tell_the_time_left(clock):
     out = io.StringIO()
     shown = progress.Progress(4, 10, out)
@@ -119,14 +110,3 @@ def test_dumb_terminals_get_plain_lines(clock, monkeypatch):
         "generation 0/4  compiling\n"
         "generation 1/4  best 0.25  mean 0.3333  evaluations/s 1234  left ?\n"
     )
-
-
-def test_nobody_listening_is_no_reason_to_end(clock):
-    """A real pipe without a reader."""
-    reader, writer = os.pipe()
-    os.close(reader)
-    out = io.TextIOWrapper(io.FileIO(writer, "w"), write_through=True)
-    shown = progress.Progress(0, 3, out)
-    for generation in range(1, 4):
-        shown.show(row(generation))
-    shown.close()

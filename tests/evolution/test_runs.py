@@ -55,7 +55,6 @@ def save(run, generation, keep=3):
 
 @pytest.mark.parametrize("elsewhere", [False, True], ids=["beside", "elsewhere"])
 def test_a_run_folder_is_whole(tmp_path, monkeypatch, elsewhere):
-    """All that a configuration names is copied; the folder moves, and the originals may go."""
     monkeypatch.chdir(tmp_path)
     mine = tmp_path / "mine"
     for name in ("mine/fields", "mine/twin", "sea"):
@@ -116,7 +115,6 @@ def test_a_world_mapping_keeps_its_field(tmp_path, config):
 
 
 def test_older_run_folders_open(tmp_path, config):
-    """They name a world of the user's by its absolute path, and have no hashes of copies."""
     (tmp_path / "sea.yaml").write_text("density: 1030.0\n")
     run, _ = runs.create_run_folder(tmp_path / "run", config)
     run.save_config(override_config(run.load_config(), {"world": str(tmp_path / "sea.yaml")}))
@@ -127,7 +125,6 @@ def test_older_run_folders_open(tmp_path, config):
 
 
 def test_older_runs_keep_the_core_and_the_length_at_rest(tmp_path, config):
-    """Their config.yaml has no such settings, and their fingerprints lack them."""
     older = override_config(config, {"task.point": "core", "task.length": "rest"})
     run, _ = runs.create_run_folder(tmp_path / "run", older)
     text = (run.path / "config.yaml").read_text()
@@ -143,7 +140,6 @@ def test_older_runs_keep_the_core_and_the_length_at_rest(tmp_path, config):
 
 
 def test_older_runs_keep_the_drag_of_faces(tmp_path, config):
-    """Their config.yaml states no drag law; that of a new run does, whatever its world's file."""
     pond = tmp_path / "pond.yaml"
     pond.write_text("drag: ellipsoid\n")
     for name, change, stated, law in (
@@ -184,7 +180,6 @@ def test_full_folder_is_refused(tmp_path, config):
 
 
 def test_a_folder_whose_making_was_cut_short_is_a_new_one(tmp_path, run, config):
-    """As kill -9 leaves it, at the last moment."""
     run.close()
     os.rename(run.path / "config.yaml", run.path / ".123-config.yaml")
     with pytest.raises(InputError, match="found one that was not begun; begin it with --out"):
@@ -227,7 +222,6 @@ def test_metrics_are_rfc_4180_at_any_time(run):
 
 
 def test_metrics_keep_the_columns_that_a_run_began_with(run):
-    """An older version's run, resumed by one that measures more, less, and in another order."""
     run.append_metrics({"generation": 1, "best": 2.0, "old": 3.0})
     run.append_metrics({"new": 4.0, "best": 5.0, "generation": 2})
     read = run.load_metrics()
@@ -387,7 +381,6 @@ def test_champion_genes_come_back_bit_for_bit(run):
 
 @pytest.mark.filterwarnings("ignore:Error reading persistent compilation cache")
 def test_a_damaged_cache_entry_costs_only_time(tmp_path):
-    """Damaged behind our back, after entries were looked through."""
     before = {
         name: getattr(jax.config, name)
         for name in ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs",

@@ -12,8 +12,6 @@ from scipy.spatial.transform import Rotation
 from experiments.fit_coverage import commands
 from experiments.fit_measured import GLIDE, fit_glide, fit_lamprey, glide_errors, lamprey_ratios
 from mjx_revolve import fit as command
-from mjx_revolve.body.catalogue import MODULES
-from mjx_revolve.body.coefficients import correct_types
 from mjx_revolve.body.morphology import load_morphology, make_morphology, save_morphology
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.variants import course_targets
@@ -262,18 +260,6 @@ def test_morphologies_and_configurations_name_what_was_fitted(fitted, tmp_path):
     )
 
 
-def test_factors_of_one_coefficient_and_of_one_module():
-    robot = build_robot(load_morphology("spider"), load_world("lake"))
-    free = read_free(["drag_coefficient.x@Core", "servo_speed@left_hip", "mass"], robot)
-    found = with_values(robot, free, np.log([2.0, 0.5, 1.1])).morphology
-    core, hip = found.modules[0], next(m for m in found.modules if m.name == "left_hip")
-    assert dict(core.kind.parts[0].factors)["drag_coefficient"] == (2.0, 1.0, 1.0)
-    assert hip.kind.hinge.speed == pytest.approx(MODULES["ActiveHinge"].hinge.speed / 2)
-    assert found.mass == pytest.approx(1.1 * robot.morphology.mass)
-    with pytest.raises(InputError, match=r"water.yaml: modules.left_hip: expected `all` or a type"):
-        correct_types(MODULES, {"left_hip": {}}, "water.yaml")
-
-
 def write_csv(path, columns):
     names = list(columns)
     rows = [",".join(names)]
@@ -320,21 +306,6 @@ def test_a_bad_recording_is_one_line(kind, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["auv"], "expected a RECORDING, or --plan"),
-        (["auv", "none.csv"], "expected a CSV, an MCAP, a ROS 2 bag or a run folder; found none"),
-        (["--plan", "auv", "--free", "lift"], "--free lift: expected some of drag, added_mass"),
-        (["--plan", "auv", "--free", "drag@leg"], "--free drag@leg: expected @ and one of Core"),
-    ],
-)
-def test_wrong_arguments_are_one_line(arguments, words, capsys):
-    assert run_command(command.main, arguments) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and words in error
-
-
 MARKS = {"a": (0.0, 0.1, 0.0), "b": (0.0, -0.1, 0.0), "c": (0.05, 0.03, 0.0)}
 
 
@@ -366,16 +337,6 @@ def test_marks_that_are_not_on_the_robot_are_refused(auv, tmp_path, columns, wor
         make_problem(auv, [recording], ["drag"], FitSettings())
 
 
-def test_marks_as_they_should_be_begin_where_the_robot_is(auv, tmp_path):
-    write_csv(tmp_path / "swim.csv", marks())
-    where = [f"mark.{k}=core:{','.join(map(str, v))}" for k, v in MARKS.items()]
-    recording = load_recording(tmp_path / "swim.csv", auv, read_map(where))
-    problem = make_problem(auv, [recording], ["drag"], FitSettings(window=1.0, held_out=0.0))
-    np.testing.assert_allclose(problem.roots[4, :2, 0], [0.2, 0.0], atol=2e-3)
-    np.testing.assert_allclose(problem.roots[4, 7:9, 0], [0.2, 0.0], atol=5e-3)
-    np.testing.assert_allclose(problem.roots[4, 12, 0], 0.3, atol=5e-3)
-
-
 def test_units_gaps_and_factors_of_columns(auv, tmp_path):
     columns = swim()
     columns = {"frame": 20 * columns["time"], "px": 500 * columns["x"], "y_mm": 1e3 * columns["y"],
@@ -389,20 +350,6 @@ def test_units_gaps_and_factors_of_columns(auv, tmp_path):
     assert found.notes == (
         "frames at 20 Hz: 0 dropped, 1 gaps of up to 0.55 s",
         "no commands of bow, stern, starboard, port: taken to be 0",
-    )
-
-
-def test_a_bag_of_ours_is_read(auv, tmp_path):
-    pytest.importorskip("rosbags", reason="the package rosbags reads bags")
-    from mjx_revolve.formats.ros_bag import write_bag
-
-    trajectory = simulate(auv, [0.5] * 4, 1.0, once=True)
-    write_bag(auv, trajectory, tmp_path / "swim.mcap")
-    found = load_recording(tmp_path / "swim.mcap", auv, {})
-    assert {"x", "qw", "command.port"} <= set(found.signals)
-    rows = np.round((found.signals["x"].time + 0.01) / auv.world.timestep).astype(int) - 1
-    np.testing.assert_allclose(
-        found.signals["y"].value, np.asarray(trajectory.qpos)[rows, 1], atol=1e-6
     )
 
 

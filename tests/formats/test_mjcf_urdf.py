@@ -10,11 +10,9 @@ from exports import NAMES, angles_of, forward, lake_robot, odd_episode
 from laboratory import body
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.formats.export import export_robot
-from mjx_revolve.formats.links import make_links, rest_pose, roll_pitch_yaw
+from mjx_revolve.formats.links import make_links, rest_pose
 from mjx_revolve.formats.mjcf import make_mjcf
-from mjx_revolve.formats.urdf import make_urdf
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.numerics.spatial import quat_to_matrix
 from mjx_revolve.water.world import load_world
 
 
@@ -38,16 +36,6 @@ def test_links_stand_where_their_hinges_do(robot):
                 robot.morphology.modules[robot.fluid.module[part.row]].rgb or (0.5, 0.5, 0.5)
             )
     assert sum(link.mass for link in links) == pytest.approx(robot.morphology.mass)
-
-
-@pytest.mark.parametrize("pitch", [0.3, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-7])
-def test_angles_turn_as_the_matrix_does(pitch):
-    def turn(axis, angle):
-        return quat_to_matrix([np.cos(angle / 2), *(np.sin(angle / 2) * np.eye(3)[axis])])
-
-    rotation = turn(2, -0.7) @ turn(1, pitch) @ turn(0, 2.1)
-    roll, back, yaw = roll_pitch_yaw(rotation)
-    np.testing.assert_allclose(turn(2, yaw) @ turn(1, back) @ turn(0, roll), rotation, atol=1e-9)
 
 
 def load_mjcf(robot):
@@ -150,28 +138,6 @@ def test_mjcf_has_mujocos_own_drag_where_the_world_has(drag):
     data.qvel[0] = 0.3
     mujoco.mj_forward(model, data)
     assert (data.qfrc_passive[0] < 0) == (drag != "off")
-
-
-def test_urdf_is_the_same_robot_to_mujoco(robot):
-    ours, angles = robot.mj_model, angles_of(robot, 1)
-    model = mujoco.MjModel.from_xml_string(make_urdf(robot, meshes=None))
-    links = make_links(robot)
-    data = mujoco.MjData(model)
-    for link, angle in zip(links[1:], angles, strict=True):
-        joint = model.joint(link.joint.name)
-        data.qpos[joint.qposadr] = angle
-        np.testing.assert_allclose(joint.range, ours.jnt_range[link.body - 1], atol=1e-9)
-    mujoco.mj_kinematics(model, data)
-    position, rotation = forward(robot, angles)
-    for index, link in enumerate(links):
-        mine = model.body(link.name).id
-        assert model.body_mass[mine] == pytest.approx(link.mass)
-        np.testing.assert_allclose(model.body_ipos[mine], link.center_of_mass, atol=1e-9)
-        np.testing.assert_allclose(
-            np.sort(model.body_inertia[mine]), np.sort(ours.body_inertia[link.body]), rtol=1e-6
-        )
-        np.testing.assert_allclose(data.xpos[mine], position[index], atol=1e-9)
-        np.testing.assert_allclose(data.xmat[mine].reshape(3, 3), rotation[index], atol=1e-9)
 
 
 def test_urdf_is_the_same_robot_to_yourdfpy(robot, tmp_path):

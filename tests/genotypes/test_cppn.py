@@ -9,7 +9,6 @@ from mjx_revolve.genotypes.cppn import CPPN, Connection, Node
 from mjx_revolve.genotypes.cppn_genotype import grow
 from mjx_revolve.genotypes.genotype import Space
 from mjx_revolve.genotypes.kinds import find_genotype
-from mjx_revolve.inputs.errors import InputError
 
 SPACE = Space(MODULES, ("FixedBrick", "ActiveHinge"), "Core", 1, 30, 0, 20)
 # Inputs by number; outputs: no module, a brick, a hinge, quarter turns.
@@ -59,17 +58,6 @@ def test_what_overlaps_is_left_out_and_bounds_are_kept():
         assert len(centers) == most
     short = Space(MODULES, ("FixedBrick", "ActiveHinge"), "Core", 1, 30, 0, 20, max_length=0.18)
     assert grow(everywhere, short).length <= 0.18
-
-
-def test_networks_of_other_spaces_are_refused():
-    genotype = find_genotype("cppn", SPACE, {}, "test.yaml")
-    with pytest.raises(
-        InputError, match=r"genome: expected 5 inputs and 4 outputs, for 2 types of"
-    ):
-        genotype.from_plain(CPPN(5, 5, (), ()).to_plain())
-    space = Space(MODULES, ("FixedBrick", "ActiveHinge"), "Core", 3, 30, 0, 20)
-    with pytest.raises(InputError, match="expected 3 to 30 modules; found 1"):
-        find_genotype("cppn", space, {}, "x").from_plain(CPPN(5, 4, (), ()).to_plain())
 
 
 @pytest.mark.parametrize("innovations", [True, False])

@@ -1,8 +1,7 @@
 """What all genotypes promise: bodies that are valid, within bounds, and that files give back."""
 
 import json
-import re
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import pairwise
 from statistics import median
 
@@ -15,12 +14,9 @@ from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import load_morphology, make_morphology, save_morphology
 from mjx_revolve.body.placement import find_overlaps
 from mjx_revolve.episodes import bodies_config
-from mjx_revolve.genotypes.cppn import CPPNSettings
 from mjx_revolve.genotypes.genotype import TRIES, Space, accept_all, make_space
 from mjx_revolve.genotypes.kinds import find_genotype
-from mjx_revolve.genotypes.plasticoding import PlasticodingSettings
 from mjx_revolve.genotypes.table import GENOTYPES
-from mjx_revolve.genotypes.tree import TreeSettings
 from mjx_revolve.inputs.errors import InputError
 
 ROBOTS = [*sorted((ROOT / "morphologies").glob("*.yaml")), *WILD]
@@ -209,10 +205,6 @@ def test_the_space_says_what_it_refuses():
     assert "found 'ActiveHinge'" in replace(loose, catalogue={"Core": MODULES["Core"]}).refuses(
         spider
     )
-    limb = {1: {"type": "FixedBrick", "children": {2: {"type": "FixedBrick", "children": {
-        2: {"type": "FixedBrick"}}}}}}  # fmt: skip
-    folded = make_morphology({"type": "Core", "children": limb}, allow_overlap=True)
-    assert "expected modules that do not overlap; found" in loose.refuses(folded)
 
 
 def test_spaces_are_made_of_types_that_there_are():
@@ -373,36 +365,3 @@ def test_the_pages_configuration_is_one():
     for name in GENOTYPES:
         body = make(name, space).develop(make(name, space).random(np.random.default_rng(0)))
         assert space.refuses(body) is None
-
-
-@pytest.mark.parametrize("kind", [TreeSettings, PlasticodingSettings, CPPNSettings])
-def test_the_page_has_all_settings_with_their_defaults(kind):
-    said = {}
-    for line in PAGE.splitlines():
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        if line.startswith("| `") and len(cells) == 3:
-            names = re.findall(r"`(\w+)`", cells[0])
-            values = [yaml.safe_load(value) for value in cells[1].split(",")]
-            values *= len(names) // len(values)
-            for name, value in zip(names, values, strict=True):
-                said.setdefault(name, set()).add(value)
-    for field in fields(kind):
-        assert getattr(kind(), field.name) in said[field.name], field.name
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-("return Genotype(", "return (lambda *a, **k: 3)(", "worm: expected a Genotype; found int"),
-("1 - bits[k]", "1 / 0", "line 15: expected worm to mutate; found ZeroDiv"),
-("space.max_modules - 1", "99", "worms.py: worm: develop: expected 2 to 6 modules; found"),
-("to_plain=list", "to_plain=set", "worm: to_plain: expected what JSON can hold; found: ")
-],
-)  # fmt: skip
-def test_mistakes_in_ones_own_are_one_line(tmp_path, old, new, message):
-    assert block("python").count(old) == 1
-    (tmp_path / "worms.py").write_text(block("python").replace(old, new))
-    space = replace(SPACES["bricks and hinges"], max_modules=6, max_hinges=90)
-    with pytest.raises(InputError) as error:
-        make(f"{tmp_path}/worms.py:worm", space)
-    assert message in str(error.value) and "\n" not in str(error.value)

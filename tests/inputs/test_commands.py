@@ -2,15 +2,12 @@
 
 import errno
 import logging
-import re
 import subprocess
 import sys
 
 import pytest
 
 from laboratory import ROOT
-from mjx_revolve import __main__
-from mjx_revolve.__main__ import COMMANDS
 from mjx_revolve.inputs.commands import (
     Parser,
     check_place,
@@ -42,17 +39,6 @@ def test_help_loads_nothing_heavy(name, words):
     )
     assert done.returncode == 0, done.stderr
     assert words in done.stdout
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_help_has_examples_of_its_own_options(name, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["mjx-revolve"])
-    with pytest.raises(SystemExit):
-        __main__._main([name, "--help"])
-    usage, _, examples = capsys.readouterr().out.partition("\nexample")
-    assert f"mjx-revolve {name}" in examples
-    for word in re.findall(r"--\S+", examples):
-        assert word in usage
 
 
 @pytest.mark.parametrize(

@@ -151,12 +151,8 @@ def test_wrong_tasks(folder, text, message):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-("def make_hold", "def make_other", "controller.type: expected a function make_hold in "
-         "{own}; found only rise, bare, make_other"),
 ("Controller(n,", "Controller(n + 1,", "{own}: make_hold: gene_names: expected 3 of them, "
          "as num_genes says; found 2"),
-("parameters + 0 * state", "parameters[0]", "{own}: make_hold: step: expected targets "
-         "[n, lanes], here [2, 3]; found [3]"),
 ("jnp.sin(genes)", "jnp.sin(gene)", "{own}: line 38: expected make_hold's decode, init and "
          "step to give targets; found NameError: name 'gene' is not defined")
 ],

@@ -6,8 +6,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import pytest
-from annotated_types import Ge, Le, Lt, MinLen, Unit
-from pydantic import BaseModel
+from annotated_types import Ge, Lt, Unit
 
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.schema import (
@@ -28,7 +27,6 @@ from mjx_revolve.inputs.schema import (
     read,
     words,
 )
-from mjx_revolve.inputs.validation_messages import describe
 
 
 @checked
@@ -120,33 +118,3 @@ def test_complaints(values, message):
         assert message in found and "\n" not in found
         if name != "here":
             assert found.startswith(f"tree {given['name']!r}: ")
-
-
-def test_places_go_in_front():
-    with pytest.raises(InputError, match=r"^garden.2.leaves.0: expected a mapping with length; f"):
-        read(Tree, {"name": "ash", "leaves": [3]}, "garden.2")
-    with pytest.raises(InputError, match=r"^garden: expected a mapping with name; found 3$"):
-        read(Tree, 3, "garden")
-    with pytest.raises(InputError, match=r"^leaf: length: expected a number > 0 \[m\]; found none"):
-        Leaf()
-
-
-class Model(BaseModel):
-    """Described like a checked class."""
-
-    leaf: Leaf
-    size: Annotated[float, Ge(0.5), Le(2)] = 1.0
-
-
-@pytest.mark.parametrize(
-    ("kind", "text"),
-    [
-        (Number, "a number"),
-        (Annotated[Number, Ge(-0.5), Le(1), Unit("m")], "a number >= -0.5 and <= 1 [m]"),
-        (Annotated[Number, Unit("m")] | None, "a number [m], or nothing"),
-        (Annotated[TupleOf[Integer], MinLen(1)], "a list of whole numbers"),
-        (Model, "a mapping with leaf"),
-    ],
-)
-def test_types_in_words(kind, text):
-    assert describe(kind) == text

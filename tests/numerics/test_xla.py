@@ -14,7 +14,6 @@ from mjx_revolve.numerics.xla import (
     fuse,
     fuse_outermost,
     fuse_step,
-    materialize,
     on_cpu,
     over_chunks,
 )
@@ -135,14 +134,6 @@ def test_a_function_is_fused_once_whatever_its_caller_does():
     assert "materialize" in str(alone) and str(within) == str(plainly)
     assert set(map(type, seen)) == {float}
     assert (fuse_outermost(scaled, LANES, 2.0) == step(2.0 * LANES)).all()
-
-
-def test_a_materialized_value_has_batches_and_gradients():
-    fun = lambda x: jnp.sum(materialize(jnp.tanh(x)) * x)  # noqa: E731
-    expected = jax.jit(jax.grad(lambda x: jnp.sum(jnp.tanh(x) * x)))(LANES)
-    np.testing.assert_allclose(jax.jit(jax.grad(fun))(LANES), expected, rtol=1e-6)
-    both = jax.jit(jax.vmap(fun))(jnp.stack([LANES, 2 * LANES]))
-    np.testing.assert_allclose(both, [fun(LANES), fun(2 * LANES)], rtol=1e-6)
 
 
 def test_without_the_annotations_the_results_are_the_same(monkeypatch):

@@ -7,11 +7,9 @@ import re
 import numpy as np
 import pytest
 
-from mjx_revolve import replay, report, viewer
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.episodes.individual_log import read_generations, read_individuals
-from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.view.body_pictures import SIZE, draw_bodies
 from mjx_revolve.view.population import (
     pick_ancestors,
@@ -239,49 +237,3 @@ def test_what_is_left_is_shown(run, still, damage, message):
     assert message in record.warning
     page = report_page.make_report([record])
     assert ("Body of individual" in page) == (run / "individuals.jsonl").is_file()
-
-
-@pytest.mark.parametrize(
-    ("main", "argv", "message"),
-    [
-        (report, ["run", "--individuals", "worst"], "expected best, archive, or numbers"),
-        (viewer, ["run", "--individual", "77"], "expected individual 77; found those from 0 to 5"),
-        (viewer, ["run", "--individual", "1", "--world", "lake"], "expected none: a champion"),
-    ],
-)
-def test_wrong_commands(run, main, argv, message, capsys):
-    assert run_command(main.main, argv) == 2
-    assert message in capsys.readouterr().err
-
-
-def test_a_film_of_ancestors(run, monkeypatch, capsys):
-    """The line at equal distances, each for five seconds at most, in one file."""
-    asked, made = [], []
-
-    class Episode(str):
-        """Stands for one; films are not drawn here."""
-
-    def load(folder, numbers, duration, seed):
-        asked.append((list(numbers), duration))
-        return [Episode(number) for number in numbers]
-
-    class Film:
-        lost, fps, size, time, robots = None, 10, (64, 64), range(30), (None,)
-
-    def write(films, opengl, mp4, gif):
-        made.append((len(films), mp4, gif))
-        mp4.parent.mkdir(exist_ok=True)
-        mp4.write_bytes(b"film")
-
-    cuts = []
-    monkeypatch.setattr("mjx_revolve.replay.find_opengl", lambda: "egl")
-    monkeypatch.setattr("mjx_revolve.episodes.champion.load_individuals", load)
-    monkeypatch.setattr("mjx_revolve.view.poses.cut_episode", lambda e, s: cuts.append(s) or e)
-    monkeypatch.setattr("mjx_revolve.view.film.film.make_film", lambda *_: Film())
-    monkeypatch.setattr("mjx_revolve.view.film.video.write_film", write)
-    assert run_command(replay.main, ["run", "--ancestors", "1"]) == 0
-    assert run_command(replay.main, ["run", "--ancestors", "4", "--individual", "4",
-                                     "--duration", "2"]) == 0  # fmt: skip
-    assert asked == [([1, 5], None), ([0, 4], 2.0)] and cuts == [5.0, 5.0]
-    assert [entry[1].name for entry in made] == ["ancestors.mp4", "4-ancestors.mp4"]
-    assert "6 s, 2 robots" in capsys.readouterr().out

@@ -38,7 +38,6 @@ def history():
 
 
 def test_events_are_read_back(tmp_path):
-    """Damaged lines are left out and counted; one that is being written is no damage."""
     base = {"id": 0, "place": [1, 2, -1]}
     born = {"time": 0.0, "event": "birth", "place": [1, 2, None], "parents": [], "origin": ""}
     good = [
@@ -75,7 +74,6 @@ def test_history_by_hand(history):
 
 
 def test_births_and_deaths_add_up(history):
-    """Bars upwards are the births, those downwards the deaths."""
     top, low = plot_population(history, 8).axes
     bars = np.array([patch.get_height() for patch in low.patches])
     assert bars[bars > 0].sum() == 5 and bars[bars < 0].sum() == -2
@@ -121,7 +119,6 @@ def run(tmp_path_factory):
 
 @pytest.mark.slow
 def test_the_report_of_a_colony(run, tmp_path):
-    """Its own section, its own words, nothing that speaks of generations' starts."""
     page = tmp_path / "page.html"
     assert run_command(report.main, [str(run), "--out", str(page)]) == 0
     text = page.read_text()

@@ -86,16 +86,6 @@ def test_rows_after_the_first_that_is_not_finite_are_left_out(elbow, sine):
         analyse_motion(elbow, episode(elbow, TIME, np.nan * qpos))
 
 
-def test_who_stays_has_no_heading_and_no_speed(elbow):
-    still = np.tile(elbow.mj_model.qpos0, (len(TIME), 1))
-    motion = analyse_motion(elbow, episode(elbow, TIME, still))
-    assert motion.along.tolist() == [1.0, 0.0]
-    assert (motion.speed, motion.period) == (0.0, None)
-    assert motion.poses == [len(TIME) - 1]
-    one = analyse_motion(elbow, episode(elbow, TIME[:1], still[:1]))
-    assert (one.speed, one.poses, one.first) == (0.0, [0], 0)
-
-
 def test_a_task_counts_from_its_first_record():
     # Records every 0.1 s, the first of them one interval late: 2.0 s are the rows 0 to 19.
     assert counted_time(
@@ -124,15 +114,6 @@ def test_period_of_a_stroke(period):
     phase = 2 * np.pi * TIME[:, None] / period
     angles = np.column_stack([np.sin(phase), 0.3 * np.sin(2 * phase + 1), 0 * phase])
     assert stroke_period(TIME, 0.5 * angles) == pytest.approx(period, rel=0.02)
-
-
-def test_no_period_where_nothing_repeats():
-    draw = np.random.default_rng(0)
-    assert stroke_period(TIME, np.zeros((len(TIME), 2))) is None
-    assert stroke_period(TIME, np.zeros((len(TIME), 0))) is None
-    assert stroke_period(TIME, 0.3 * draw.normal(size=(len(TIME), 2))) is None
-    assert stroke_period(TIME, 0.1 * TIME[:, None]) is None  # a drift
-    assert stroke_period(TIME[:10], np.sin(20 * TIME[:10, None])) is None  # too short to say
 
 
 def test_smooth_path_takes_out_the_strokes_alone():

@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 
 from laboratory import elbow_robot, world
-from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.control.controller import make_controller
 from mjx_revolve.episodes.config import make_config
 from mjx_revolve.episodes.fitness import make_fitness
-from mjx_revolve.view.plots import figure_svg
-from mjx_revolve.view.sensor_log import SensorTrace, trace_sensors
-from mjx_revolve.view.sensor_plots import plot_sensors
+from mjx_revolve.view.sensor_log import trace_sensors
 
 SENSORS = [
     {"type": "depth", "range": [0, 4], "noise": 0.05, "rate": 20, "delay": 0.06},
@@ -93,46 +90,3 @@ def test_what_is_true_is_the_trajectorys(seen):
     assert [one.is_exact for one in felt] == [
         not {"noise", "rate", "delay"} & set(x) for x in SENSORS if x.get("each") != "Fin"
     ]
-
-
-def drawn(sensor, rows=("",), noise=0.0, steps=800):
-    """A sensor over time, made up."""
-    draw, parts = np.random.default_rng(0), len(sensor.kind.parts)
-    low, high = sensor.limits
-    wave = np.sin(0.03 * np.arange(steps)[:, None, None] + np.arange(len(rows)))
-    true = (low + high) / 2 + (high - low) * 0.7 * wave * np.ones((1, parts, 1))
-    told = np.clip(true + noise * draw.normal(size=true.shape), low, high)
-    return SensorTrace(sensor, rows, told, true)
-
-
-def test_the_picture_has_each_sensor_once():
-    legs = ("core", "hip", "knee")
-    felt = [
-        drawn(Sensor(type="depth", range=(0, 4), noise=0.1, rate=20, delay=0.06)),
-        drawn(Sensor(type="accelerometer", at="foot"), noise=9.0),
-        drawn(Sensor(type="speed"), legs[1:]),
-        drawn(Sensor(type="bearing")),
-        drawn(Sensor(type="flow", each="FixedBrick", noise=0.01), legs),
-        drawn(Sensor(type="touch", at="pad"), noise=0.1),
-    ]
-    time = 0.01 * np.arange(800)
-    figure = plot_sensors(time, felt)
-    titles = [axes.get_title(loc="left") for axes in figure.axes]
-    assert [x for x in titles if x] == [
-        "depth", "foot accelerometer", "bearing", "pad touch",
-        "speed", "FixedBrick flow x", "FixedBrick flow y", "FixedBrick flow z",
-    ]  # fmt: skip
-    errors = [axes.get_title(loc="right") for axes in figure.axes[:4]]
-    assert errors == ["noise 0.1 m, 20 Hz, 60 ms late", "exact", "exact", "exact"]
-    assert [axes.get_ylabel() for axes in figure.axes[:4]] == ["m", "m/s²", "", "N"]
-    legend = [x.get_text() for x in figure.subfigs[0].legends[0].get_texts()]
-    assert legend == ["x / left", "y / right", "z", "spread", "what was true", "end of the range"]
-    # What is told, with its noise, is within the frame; what is true may be beyond.
-    for axes, one in zip(figure.axes, (felt[0], felt[1], felt[3], felt[5]), strict=False):
-        low, high = axes.get_ylim()
-        assert low < one.given.min() and one.given.max() < high
-    # A curve that turns at each step is its mean and its spread; the others are lines.
-    assert [bool(axes.collections) for axes in figure.axes[:4]] == [False, True, False, True]
-    assert len(figure_svg(figure)) < 400_000
-    assert figure_svg(plot_sensors(time, felt[:1])) == figure_svg(plot_sensors(time, felt[:1]))
-    assert len(plot_sensors(time, [felt[2]]).axes) == 2  # strips alone, and their bar

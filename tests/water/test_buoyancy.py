@@ -58,18 +58,6 @@ def attitudes(n, seed=0):
     return up / np.linalg.norm(up, axis=1)[:, None]
 
 
-def test_the_reference_itself_against_counting_points():
-    # 4e5 random points: the standard error of a share is below 0.0008.
-    draw = np.random.default_rng(3)
-    half = np.array([0.3, 0.7, 1.0])
-    points = draw.uniform(-1, 1, (400_000, 3)) * half
-    for up, depth in zip(attitudes(6), (-0.5, -0.1, 0.0, 0.1, 0.3, 0.6), strict=True):
-        wet = points @ up < depth
-        share, moment = clip_box(up, depth, half)
-        assert share == pytest.approx(wet.mean(), abs=0.004)
-        assert moment == pytest.approx((points * wet[:, None]).mean(0), abs=0.004)
-
-
 # Level, on edge and on corner, where the heights of edges vanish or are equal; signs too.
 SPECIAL = [
     np.array(n) / np.linalg.norm(n) for n in itertools.product((0.0, -1.0, 1.0), repeat=3) if any(n)
@@ -159,33 +147,6 @@ def test_force_moment_and_gradients_are_continuous_through_the_surface(name):
             fine = np.abs(np.diff(rows, axis=0)).max(0)
             coarse = np.abs(np.diff(rows[::2], axis=0)).max(0)
             assert np.all(fine < 0.7 * coarse + 1e-9), tilt
-
-
-def test_only_a_level_face_changes_the_slope_at_once_and_by_its_area():
-    """The one jump of geometry itself: ∂share/∂d of a level box is its waterplane or nothing.
-
-    Any tilt spreads it over the height by which the face is tilted.
-    """
-    half = np.array([0.3, 0.2, 0.1])
-    slope = jax.jit(
-        jax.vmap(jax.grad(lambda d, t: cut_box(tilted(t), d, tuple(half))[0]), (0, None))
-    )
-    just = 1e-9
-    with jax.enable_x64(True):
-        around = [-0.1 - just, -0.1 + just, 0.1 - just, 0.1 + just]
-        assert np.asarray(slope(np.array(around), 0.0)) == pytest.approx([0, 5, 5, 0], abs=1e-9)
-        # Flush: neither, but between both.
-        flush = np.asarray(slope(np.array([-0.1, 0.1]), 0.0))
-        assert np.all((flush >= 0) & (flush <= 5))
-        for tilt in (1e-6, 1e-4, 1e-2):
-            # At a corner the waterplane starts as a point: it grows with the square.
-            height = np.abs(np.array(tilted(tilt)) @ (half * [1, 1, 0]))
-            reach = height + 0.1 * np.cos(tilt)
-            depth = -reach + np.array([0.0, 1e-3, 2.0]) * height
-            found = np.asarray(slope(depth, tilt))
-            assert found[0] == pytest.approx(0.0, abs=1e-9)
-            assert 0 < found[1] < 1e-4
-            assert found[2] == pytest.approx(5 / np.cos(tilt), rel=1e-6)
 
 
 def potential(state, half):

@@ -126,19 +126,6 @@ def test_coefficients_may_differ_from_axis_to_axis():
     assert given.modules[0].kind.parts[0].drag_coefficient == (1.0, 2.0, 3.0)
 
 
-@pytest.mark.parametrize(
-    "params, text",
-    [
-        ("drag_coefficient: [1, 2]", "a number >= 0, or three, one for each axis; found .1, 2"),
-        ("fossen: {added_mass: [1, 2]}", "expected six numbers, or six rows of six"),
-        ("fossen: {added_mass: [1, 1, 1, 1, 1, -1]}", "a matrix without negative eigenvalues"),
-    ],
-)
-def test_what_is_no_such_matrix_is_refused(params, text):
-    with pytest.raises(InputError, match=text):
-        read(f"body: {{type: Core, params: {{{params}}}}}")
-
-
 def test_where_they_may_stand():
     whole = "body: {type: Core, params: {fossen: {whole: true}}, children: {1: {type: %s}}}"
     body = read(whole % "FixedBrick")

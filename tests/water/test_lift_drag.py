@@ -1,7 +1,6 @@
 """Gazebo's LiftDrag: against its source, by hand at chosen angles, its limits and its step."""
 
 import math
-from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -139,53 +138,6 @@ def test_named_departures():
     )
 
 
-def test_pitching_moment():
-    """About n = forward × upward, nose up: slope α q A up to the stall, then the other slope."""
-    p = LiftDrag(cma=0.3, alpha_stall=0.4, cma_stall=-0.5)
-    q = 0.5 * RHO * AREA
-    for alpha, c in [
-        (0.1, 0.03),
-        (0.4, 0.12),
-        (0.5, 0.07),
-        (0.7, 0.0),
-        (-0.2, -0.06),
-        (-0.6, -0.02),
-    ]:
-        assert wrench(flow(alpha), p)[1][:, 0] == pytest.approx([0, -c * q, 0], abs=1e-12)
-    flat = LiftDrag(alpha_stall=0.4, cma_stall=-0.5)  # nose down after the stall alone
-    assert wrench(flow(0.6), flat)[1][1] == pytest.approx(0.1 * q)
-
-
-@pytest.mark.slow
-def test_each_plate_its_own_numbers():
-    """Coefficients, areas and directions as `[npart, nbody, 1]`, mixed with round ones."""
-    plates = list(PLATES.values())
-    stack = lambda xs: np.array(xs, float).reshape(3, 2, 1)  # noqa: E731
-    together = object.__new__(LiftDrag)
-    for name in LiftDrag.__dataclass_fields__:
-        values = [getattr(p, name) for p in plates]
-        object.__setattr__(together, name, None if values[0] is None else stack(values))
-    object.__setattr__(together, "density", stack(np.arange(6) + 900.0))
-    directions = [turn(rotation_of(k), X, Z) for k in range(6)]
-    forward, upward = (
-        tuple(stack([d[i][j] for d in directions]) for j in range(3)) for i in (0, 1)
-    )
-    area = stack(np.arange(6) + 1.0)
-    v = np.random.default_rng(6).normal(size=(3, 50))
-    for dtype, digits in ((jnp.float64, 1e-9), (jnp.float32, 2e-2)):
-        with jax.enable_x64(dtype == jnp.float64):
-            flows = tuple(jnp.asarray(x, dtype) for x in v)
-            found = lift_drag_wrench(flows, forward, upward, area, RHO, together)
-            damping = lift_drag_damping(flows, forward, upward, area, RHO, together)
-        assert {x.dtype for w in found for x in w} | {damping.dtype} == {jnp.dtype(dtype)}
-        assert damping.shape == found[0][0].shape == (3, 2, 50)
-        for k, p in enumerate(plates):
-            alone = wrench(v, replace(p, density=900.0 + k), *directions[k], area=k + 1.0)
-            for a, b in zip(found, alone, strict=True):
-                a = np.stack([np.broadcast_to(x, (3, 2, 50))[k // 2, k % 2] for x in a])
-                assert a == pytest.approx(b, abs=digits)
-
-
 @pytest.mark.parametrize("plate", PLATES)
 def test_never_adds_energy(plate):
     """Lift stands across the flow in the plate's plane, drag against it."""
@@ -273,15 +225,6 @@ def test_finite_everywhere(plate, dtype):
     assert np.abs(value[0]).max() == 0  # at rest
     if plate != "round":
         assert np.abs(value[2, :6]).max() == 0  # along the span
-
-
-def test_gazebo_defaults():
-    p = LiftDrag()
-    assert (p.a0, p.cla, p.cda, p.cma) == (0, 1, 0.01, 0)
-    assert (p.alpha_stall, p.cla_stall, p.cda_stall, p.cma_stall) == (math.pi / 2, 0, 1, 0)
-    assert (p.area, p.forward, p.upward, p.cp, p.density) == (None,) * 5
-    assert p.radial_symmetry is False
-    assert LiftDrag(forward=(2, 0, 0), upward=[0, 0, 3]).upward == (0, 0, 1)
 
 
 BAD = [

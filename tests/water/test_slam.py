@@ -219,16 +219,3 @@ def test_entry_into_a_current_knows_only_the_relative_velocity():
     assert u[:, :3] - current[:, None] == pytest.approx(v[:, :3], abs=1e-9)
     drift = time[:, None, None] * current[:, None]
     assert p[:, :3] - drift == pytest.approx(q[:, :3], abs=1e-9)
-
-
-def test_a_floating_box_with_the_mask_hardly_chatters():
-    """All or nothing has no draft: a box hangs at its centre, in and out with every other step.
-
-    Each time in, it shares its momentum with the water, so that what is left is of the order of g
-    dt²: some steps' worth of it. Before entry slammed it was 14 mm at 5 ms.
-    """
-    for dt, most in ((0.005, 1e-3), (0.001, 1e-4)):
-        tank = world(added_mass=True, gravity=G, buoyancy="mask", drag="faces", timestep=dt)
-        robot = box_robot(tuple(SIZE), 0.6 * RHO * SIZE.prod(), tank)
-        _, q, _, _ = march(robot, 20.0, *at_rest(robot, 1, 0.005), every=round(0.005 / dt))
-        assert np.ptp(q[2000:, 2]) < most

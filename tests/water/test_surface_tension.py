@@ -51,22 +51,6 @@ def faces(half):
         yield 4 * half[j] * half[k], side * half[i] * np.eye(3)[i], j, k
 
 
-def wetting(t):
-    """Share to which a point at depth t is wet: the triangle's integral."""
-    x = np.clip(np.asarray(t) / BLUR, -1, 1)
-    return np.where(x < 0, (1 + x) ** 2 / 2, 1 - (1 - x) ** 2 / 2)
-
-
-def counted_energy(up, depth, half, angle, n=400):
-    """E by counting points on the faces."""
-    u, v = np.meshgrid(*[(np.arange(n) + 0.5) / n * 2 - 1] * 2)
-    total = 0.0
-    for area, center, j, k in faces(half):
-        t = depth - up @ center - up[j] * half[j] * u - up[k] * half[k] * v
-        total -= area * wetting(t).mean()
-    return TENSION * np.cos(angle) * total
-
-
 def energy(up, depth, half, angle):
     """E by the corners of the faces: the textbook's sum, for edges far from level."""
     total = 0.0
@@ -85,15 +69,6 @@ def energy_slopes():
     """One program for all boxes and angles: slopes of `energy` by vertical and depth."""
     slope = jax.vmap(jax.grad(energy, (0, 1)), (0, 0, None, None))
     return jax.jit(slope, compiler_options=QUICK)
-
-
-def test_the_reference_itself_against_counting_points():
-    for up, depth in zip(attitudes(4), (-0.01, 0.0, 0.004, 0.02), strict=True):
-        for half in BOXES.values():
-            counted = counted_energy(up, depth, half, 1.0)
-            with jax.enable_x64(True):
-                exact = float(energy(jnp.asarray(up), depth, half, 1.0))
-            assert exact == pytest.approx(counted, rel=1e-4)
 
 
 @pytest.mark.slow

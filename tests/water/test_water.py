@@ -139,15 +139,6 @@ def test_slope_of_the_surface(depth):
 
 
 @pytest.mark.parametrize("depth", DEPTHS)
-def test_orbital_velocity_has_a_potential_and_no_divergence(depth):
-    world, place = make_world(waves=SEA, water_depth=depth), places()
-    slopes = differences(lambda p: moving(world, p, 0.6)[0], place)  # [direction, component, n]
-    assert np.abs(slopes).max() > 0.3
-    assert np.abs(np.trace(slopes)).max() < 1e-8
-    assert np.abs(slopes - slopes.transpose(1, 0, 2)).max() < 1e-8
-
-
-@pytest.mark.parametrize("depth", DEPTHS)
 @pytest.mark.parametrize("wave", SEA)
 def test_orbital_velocity_is_the_gradient_of_the_textbooks_potential(wave, depth):
     """Φ = a g/ω cosh k(h + z)/cosh(k h) sin θ: the same law by another formula."""
@@ -246,23 +237,6 @@ def grid(axes, seed=0):
     """Random velocities on it."""
     shape = (*map(len, axes), 3)
     return CurrentField(*axes, np.random.default_rng(seed).normal(size=shape))
-
-
-@pytest.mark.parametrize("axes", [EVEN, UNEVEN], ids=["even", "uneven"])
-def test_interpolation_is_exact_for_what_is_linear_along_each_axis(axes):
-    draw = np.random.default_rng(1)
-    factors = draw.normal(size=(3, 2, 2, 2))
-
-    def law(x, y, z):
-        powers = [[x**i * y**j * z**k for k in (0, 1)] for i in (0, 1) for j in (0, 1)]
-        return np.einsum("cijk,ijk...->c...", factors, np.reshape(powers, (2, 2, 2, *x.shape)))
-
-    velocity = law(*np.meshgrid(*axes, indexing="ij"))
-    field = CurrentField(*axes, np.moveaxis(velocity, 0, -1))
-    low, high = [a[0] for a in axes], [a[-1] for a in axes]
-    place = draw.uniform(low, high, (500, 3)).T
-    found = moving(make_world(current_field=field), place)[0]
-    assert np.allclose(found, law(*place), rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("axes", [EVEN, UNEVEN], ids=["even", "uneven"])
