@@ -132,11 +132,11 @@ SENSORS: Mapping[str, SensorKind] = {
                     "torque of each servo under its last command", where="joint", signals="load"),
     "contact": _number(
         "touch", "N", (0, 1),
-        "force of the bed on the core's rigid body and on what each hinge carries",
+        "force of contacts on the core's rigid body and on what each hinge carries",
         where="body", signals="touch",
     ),
     "touch": _vector(
-        "cells", "N", 1, "force of the bed on the two halves of a module, along its normal",
+        "cells", "N", 1, "force of contacts on the two halves of a module, along its normal",
         parts=("left", "right"), range=(0, 1), where="module", signals="cells",
     ),
 }  # fmt: skip

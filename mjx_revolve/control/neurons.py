@@ -10,7 +10,7 @@ Where Revolve's code differs from its documentation, or leaves something open:
 - An output is clipped to 0 to 1, and that is the hinge's whole range; of several for one hinge, the
   first in the file counts. A hinge without an output stays in the middle.
 - The inputs of a module are its input neurons in the file's order: of the core its accelerometer's
-  x, y, z, then its gyro's [m/s², rad/s]; of a touch sensor its two cells, the force of the bed on
+  x, y, z, then its gyro's [m/s², rad/s]; of a touch sensor its two cells, the contact force on
   its left and its right half as seen in the direction in which it is attached, as a share of 1 N.
 - Two connections between the same neurons add up. One into an Oscillator does nothing.
 """

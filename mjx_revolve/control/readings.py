@@ -154,14 +154,14 @@ class SensorReadings(NamedTuple):
             optional: see `OPTIONAL_SIGNALS`.
         load: torque of the servos under the last command, as `angle` [N·m]; optional.
         work: done by servos and propellers so far [J]; core only, optional.
-        touch: normal force of the bed on the core's rigid body, then on the body that each hinge
-            moves, `[1 + hinge rows, lanes]` [N]; at a module that on its rigid body; optional.
+        touch: force of contacts on the core's rigid body, then on the body that each hinge moves,
+            `[1 + hinge rows, lanes]` [N]; at a module that on its rigid body; optional.
         nearest: the nearest other robot; core only, optional.
         modules: readings at modules, by signal; core only.
         course: direction to keep to, a unit vector; 0 without; core only.
         seen: whether the target is visible, `[lanes]`; None if it always is.
         present: 1 where there is a module of the type, else 0; modules only.
-        cells: normal force of the bed on the left and the right half of one module [N]; optional.
+        cells: normal force of contacts on the left and the right half of one module [N]; optional.
     """
 
     height: jax.Array
@@ -338,7 +338,7 @@ def read_sensors(
         noise=context.noise,
         load=None if memory.ctrl is None else engine.servo_torque(state, memory.ctrl),
         work=memory.work,
-        touch=engine.contact_force(state, water) if "touch" in signals else None,
+        touch=(engine.contact_force(state, water, meeting.wrench) if "touch" in signals else None),
         nearest=nearest,
         course=(zero, zero, zero) if course is None else matTvec(rotation, course.at(time)),
     )
@@ -454,7 +454,7 @@ class _RestingEngine:
     def servo_torque(self, state: PyTree, ctrl: jax.Array) -> jax.Array:
         return self._joints
 
-    def contact_force(self, state: PyTree, water: Water) -> jax.Array:
+    def contact_force(self, state: PyTree, water: Water, wrench: Any = ()) -> jax.Array:
         return self._bodies
 
     def body_motions(self, state: PyTree) -> BodyMotion:

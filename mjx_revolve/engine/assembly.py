@@ -121,21 +121,26 @@ class Assembly:
         return np.repeat(np.flatnonzero(touching), 8)
 
     @property
-    def point_right(self) -> np.ndarray:
-        """`[npoint]` whether the points lie in the right half of their part.
+    def halves(self) -> tuple[np.ndarray, np.ndarray]:
+        """`[npart, 3]` the way to each part's right, and `[npart]` its middle along that way [m].
 
         To the right of the way in which its module is attached, z up; a core looks along its y.
+        Body frame.
         """
-        layout, ways = self.layout, []
+        layout, table, ways = self.layout, self.fluid, []
         for body in self.morphologies:
             mounts = [module.kind.mount for module in body.modules]
             ways += [(0.0, 1.0, 0.0) if mount is None else mount.outward for mount in mounts]
-        right = np.cross(ways, (0.0, 0.0, 1.0))
-        part = np.flatnonzero([part.contact for part in layout.parts])
-        part = np.flatnonzero(np.isin(layout.kind, part))
-        middle = (layout.low[part] + layout.high[part])[:, None] / 2
-        aside = (layout.corners()[part] - middle) @ right[layout.module[part]][:, :, None]
-        return np.asarray(aside.ravel() > 0)
+        right = np.cross(ways, (0.0, 0.0, 1.0))[layout.module]
+        middle = table.position + turned(table.rotation, (layout.low + layout.high) / 2)
+        right = turned(table.rotation, right)
+        return right, (right * middle).sum(1)
+
+    @property
+    def point_right(self) -> np.ndarray:
+        """`[npoint]` whether the points lie in the right half of their part."""
+        (right, middle), part = self.halves, self.point_part
+        return np.asarray((right[part] * self.points[1]).sum(1) > middle[part])
 
     @cached_property
     def points(self) -> tuple[np.ndarray, np.ndarray]:

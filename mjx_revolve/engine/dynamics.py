@@ -75,7 +75,7 @@ def accelerate(
     thrusts: Any,
     dt: float,
     wrench: Any = (),
-) -> tuple[tuple[Vec, Vec, Any], Scalar, Any, Any]:
+) -> tuple[tuple[Vec, Vec, Any], Scalar, Any, Any, Any]:
     """Accelerations, by the articulated-body algorithm.
 
     With added mass, the momentum h of each body with its water turns as K(h) ν, and the step takes
@@ -96,7 +96,7 @@ def accelerate(
     Returns:
         (linear and angular acceleration of the root, body frame, as rates of the body-frame
         components [m/s², rad/s²]; of the hinges [rad/s²]); servo power, summed over the hinges
-        without sign, `[lanes]` [W]; submerged fractions and clearance, as in `State`.
+        without sign, `[lanes]` [W]; submerged fractions, clearance and pressed, as in `State`.
     """
     world, symmetric = tree.world, not (tree.carries and dt)
     meets = tree.meets and dt > 0
@@ -170,14 +170,16 @@ def accelerate(
     lane = lambda x: jnp.broadcast_to(jnp.asarray(x, dtype), (1, *lanes))[0]  # noqa: E731
     qacc = tuple(map(lane, linear)), tuple(map(lane, angular)), hinges
     clearance: Any = ()
+    pressed: Any = state.pressed
     if meets:
         factors = _Factors(moved, saved, _unflatten(whole, symmetric)[0], symmetric)
-        qacc, clearance = _with_contact(tree, state, qacc, factors, dt)
+        qacc, clearance, pressed = _with_contact(tree, state, qacc, factors, dt)
     return (
         qacc,
         jnp.broadcast_to(jnp.asarray(power, dtype), lanes),
         (submerged, tree.stack_parts(saved, lambda x: x[1])) if state.submerged else (),
         clearance,
+        pressed,
     )
 
 
@@ -272,8 +274,8 @@ def _make_respond(
 
 def _with_contact(
     tree: Tree, state: State, qacc: tuple[Vec, Vec, Any], factors: _Factors, dt: float
-) -> tuple[tuple[Vec, Vec, Any], jax.Array]:
-    """Accelerations with those of contacts within the robot, and the clearance; see `State`.
+) -> tuple[tuple[Vec, Vec, Any], jax.Array, Any]:
+    """Accelerations with those of contacts within the robot, clearance and pressed; see `State`.
 
     A robot is not looked at while its hinges cannot have turned far enough to close its clearance.
     """
@@ -282,16 +284,17 @@ def _with_contact(
     sweep = lambda steps: tree.join_rows(tree.map(_sweep, steps), like)  # noqa: E731
     ways, drifts = sweep(steps), dt**2 * sweep(qacc[2])
     drift = total(*[drifts[k] for k in range(len(drifts))])
-    found, clearance = contact_acceleration(
+    found, clearance, pressed = contact_acceleration(
         tree.meetings(like),
         state.clearance - total(*[ways[k] for k in range(len(ways))]),
         lambda which: _look_at(tree, factors, steps, qacc[2], drift, which),
         6 + len(ways),
         dt,
+        len(state.pressed),
     )
     robot = tuple(found[:3]), tuple(found[3:6]), tree.split_rows(found[6:])
     sums: tuple[Vec, Vec, Any] = jax.tree.map(jnp.add, qacc, robot)
-    return sums, clearance
+    return sums, clearance, pressed if len(state.pressed) else ()
 
 
 def _sweep(level: Level, step: Scalar) -> Scalar:

@@ -92,16 +92,32 @@ class Engine(Protocol[S]):
     def center_of_mass(self, state: S) -> Vec:
         """Centre of mass of whole robots without their water, world frame [m] (a pass)."""
 
-    def contact_force(self, state: S, water: Water) -> Float[Array, "bodies lanes"]:
-        """Force of the bed on the core's rigid body, then on what each hinge carries [N] (a pass).
+    def with_touch(self, state: S) -> S:
+        """The state from which on contacts between own modules are felt by the two functions below.
 
-        `[1 + rows of hinges, lanes]`.
+        None is before the first step.
+        """
+
+    def contact_force(
+        self, state: S, water: Water, wrench: Any = ()
+    ) -> Float[Array, "bodies lanes"]:
+        """Force of contacts on the core's rigid body, then on what each hinge carries [N] (a pass).
+
+        Args:
+            state: of the robots.
+            water: surface and current.
+            wrench: of other robots, `InteractionForces.wrench`; () for none.
+
+        Returns:
+            `[1 + rows of hinges, lanes]` of the bed and other robots; and of own modules, in the
+            last step, where the state is one `with_touch`.
         """
 
     def contact_by_half(self, state: S, water: Water) -> tuple[tuple[Array, Array], ...] | None:
-        """Normal force of the bed on the left and right half of each module [N] (a pass).
+        """Normal force of contacts on the left and right half of each module [N] (a pass).
 
-        None for many different robots.
+        Of the bed; and of own modules, in the last step, where the state is one `with_touch`. None
+        for many different robots.
         """
 
     def external_force(

@@ -25,10 +25,10 @@ from mjx_revolve.numerics.spatial import (
     Vec,
     add,
     dot,
+    mul,
     safe_norm,
     total,
     vadd,
-    vscale,
     vsub,
 )
 from mjx_revolve.water.flow import Water
@@ -115,47 +115,53 @@ def external_force(tree: Tree, state: State, water: Water, thrusts: Any) -> tupl
     return bed, wet
 
 
-def contact_force(tree: Tree, state: State, water: Water) -> Float[Array, "bodies lanes"]:
-    """Magnitude of the bed's force on each moving body.
+def contact_force(
+    tree: Tree, state: State, water: Water, wrench: Any = ()
+) -> Float[Array, "bodies lanes"]:
+    """Magnitude of the contact forces on each moving body.
 
     Args:
         tree: the robots.
         state: the population.
         water: surface and current.
+        wrench: of other robots, `InteractionForces.wrench`; () for none.
 
     Returns:
         `[1 + nhinge, lanes]` on the core's rigid body, then on what each hinge carries, in the
-        order of `Tree.join_rows` [N]; 0 where there is no bed within reach.
+        order of `Tree.join_rows`: of the sum of the forces of the bed and of other robots, and to
+        that the sum of those of own modules along their normals, see `State.pressed` [N].
     """
-    like = state.position[0]
-    if not tree.touches:
-        hinges = tree.join_rows(state.angle, like)
-        return jnp.zeros((1 + hinges.shape[0], *like.shape), like.dtype)
+    like, count = state.position[0], len(tree.join_rows(state.angle, state.position[0]))
+    pressed = state.pressed[: 1 + count]
+    if not (tree.touches or wrench or len(pressed)):
+        return jnp.zeros((1 + count, *like.shape), like.dtype)
     root, moved = _in_current(tree, state, water)
 
-    def forces(level: Level, children: Any, moved: tuple[BodyMotion, Any]) -> tuple[Any, Any, Any]:
-        motion, force = moved[0], children
-        size = jnp.zeros((level.count, *like.shape), like.dtype)
+    def forces(level: Level, children: Any, moved: tuple[BodyMotion, Any], *xs: Any) -> Any:
+        given, size = list(xs), jnp.zeros((level.count, *like.shape), like.dtype)
+        push = given.pop(0)[1] if wrench else _ZERO
+        press = add(given.pop() if given else 0.0, children[3] if children else 0.0)
         if level.points is not None:
-            own = bed_forces(tree.world, level, motion, level.points, water)[1]
-            force = own if force is None else vadd(own, force)
-        if force is not None:
-            size = size + safe_norm(tuple(add(x, jnp.zeros_like(size)) for x in force))
+            push = vadd(push, bed_forces(tree.world, level, moved[0], level.points, water)[1])
+        push = vadd(push, children[:3]) if children else push
+        force = safe_norm(tuple(add(x, size) for x in push)) + press
         # An overflow row of `BatchedTrees` is part of the body that it is fixed to.
         share: Any = 0.0
         if level.hinges is not None and isinstance(level.hinges.armature, jax.Array):
             share = jnp.where(level.hinges.armature > IMMOBILE_INERTIA / 2, 1, 0).astype(like.dtype)
-        return vscale(share, force or _ZERO), size, ()
+        return tuple(mul(share, x) for x in (*push, press)), force, ()
 
-    children, below, _ = tree.backward_pass(forces, (_ZERO, ()), moved)
-    core = forces(tree.root, children, (root, None))[1]
-    return jnp.concatenate([core, tree.join_rows(below, like)])
+    rows = (tree.split_rows(pressed[1:]),) if len(pressed) else ()
+    start = ((0.0,) * 4, ())
+    children, below, _ = tree.backward_pass(forces, start, moved, *wrench[1:], *rows)
+    core = forces(tree.root, children, (root, None), *wrench[:1], *([pressed[:1]] if rows else []))
+    return jnp.concatenate([core[1], tree.join_rows(below, like)])
 
 
 def contact_by_half(
     tree: SingleTree, state: State, water: Water
 ) -> tuple[tuple[jax.Array, jax.Array], ...]:
-    """Force of the bed on the two halves of each module.
+    """Force of contacts on the two halves of each module.
 
     As the two cells of Revolve's touch sensor: left and right of the direction in which the module
     is attached, its z up.
@@ -166,8 +172,8 @@ def contact_by_half(
         water: surface and current.
 
     Returns:
-        Of each module (left, right), the force along the bed's normal, without friction, `[lanes]`
-        each [N]; 0 where there is no bed within reach.
+        Of each module (left, right), the force along the bed's normal, without friction, and of own
+        modules along theirs, see `State.pressed`, `[lanes]` each [N].
     """
     like, assembly = state.position[0], tree.robot.assembly
     root, below = _in_current(tree, state, water)
@@ -183,6 +189,10 @@ def contact_by_half(
             point = rows[slot, body]
             module = assembly.layout.module[part[point]]
             found[module][int(right[point])].append(push[slot, body])
+    own = len(state.pressed) - 2 * len(found)
+    for k, sides in enumerate(found if own > 0 else ()):
+        for side, forces in enumerate(sides):
+            forces.append(state.pressed[own + 2 * k + side])
     none = jnp.zeros_like(like)
     return tuple((total(none, *left), total(none, *right)) for left, right in found)
 

@@ -75,6 +75,8 @@ class Meetings(NamedTuple):
         second: the other box; the same one for padding, which stands behind all pairs.
         count: `[lanes]` or `[1]` how many pairs a robot has, int32.
         steady: whether loops are to have a known length, so that they have derivatives.
+        halves: `[nshell, 5]` the module of each, the way to its right and its middle along that
+            way, body frame [m]; None of many different robots.
     """
 
     lanes: int
@@ -84,11 +86,19 @@ class Meetings(NamedTuple):
     second: Any
     count: Any
     steady: bool
+    halves: np.ndarray | None = None
 
     @staticmethod
-    def of(boxes: Boxes, body: np.ndarray, first: Any, second: Any, steady: bool) -> Meetings:
+    def of(
+        boxes: Boxes,
+        body: np.ndarray,
+        first: Any,
+        second: Any,
+        steady: bool,
+        halves: np.ndarray | None = None,
+    ) -> Meetings:
         """Of pairs of shells."""
         radius = jnp.sqrt(dot(boxes.half_size, boxes.half_size))
         count = (first != second).sum(0).astype(np.int32)
         shapes = jnp.stack([x.reshape(-1) for x in (*jax.tree.leaves(boxes), radius)])
-        return Meetings(radius.shape[1], shapes, body, first, second, count, steady)
+        return Meetings(radius.shape[1], shapes, body, first, second, count, steady, halves)

@@ -236,7 +236,13 @@ class MjxEngine:
         """Centre of mass of whole robots; see `kinematics.center_of_mass`."""
         return center_of_mass(self.tree, self._state(state))
 
-    def contact_force(self, state: MjxState, water: Water) -> Float[Array, "bodies lanes"]:
+    def with_touch(self, state: MjxState) -> MjxState:
+        """The same: contacts between own modules are not to be had."""
+        return state
+
+    def contact_force(
+        self, state: MjxState, water: Water, wrench: Any = ()
+    ) -> Float[Array, "bodies lanes"]:
         """Force of the bed on each rigid body; see `forces.contact_force`."""
         rows = forces.contact_force(self.tree, self._state(state), water)
         return self._own_order(rows, state.qpos[0])

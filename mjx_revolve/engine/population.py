@@ -87,11 +87,13 @@ class PopulationEngine:
         targets, command, thrusts, pumped = actuate(self.tree, state, ctrl)
         # The whole step is seen from the uniform current: there, no current is left.
         relative = state._replace(velocity=vsub(state.velocity, water.current))
-        qacc, power, submerged, clearance = accelerate(
+        qacc, power, submerged, clearance, pressed = accelerate(
             tree, relative, targets, water, thrusts, dt, wrench
         )
         new = integrate(state, water, qacc, dt, tree.carries)
-        new = new._replace(command=command, submerged=submerged, clearance=clearance)
+        new = new._replace(
+            command=command, submerged=submerged, clearance=clearance, pressed=pressed
+        )
         return new, add(power, pumped)
 
     def observe(self, state: State) -> tuple[Float[Array, "nq lanes"], Float[Array, "nv lanes"]]:
@@ -135,14 +137,26 @@ class PopulationEngine:
         """Centre of mass of whole robots; see `kinematics.center_of_mass`."""
         return center_of_mass(self.tree, state)
 
-    def contact_force(self, state: State, water: Water) -> Float[Array, "bodies lanes"]:
-        """Force of the bed on each rigid body; see `forces.contact_force`."""
-        return forces.contact_force(self.tree, state, water)
+    def with_touch(self, state: State) -> State:
+        """The state from which on contacts between own modules are felt; none yet."""
+        tree, like = self.tree, state.position[0]
+        if not tree.meets:
+            return state
+        rows = 1 + self.plant.num_hinge_rows
+        if isinstance(tree, SingleTree):
+            rows += 2 * tree.robot.morphology.num_modules
+        return state._replace(pressed=jnp.zeros((rows, *like.shape), like.dtype))
+
+    def contact_force(
+        self, state: State, water: Water, wrench: Any = ()
+    ) -> Float[Array, "bodies lanes"]:
+        """Force of contacts on each rigid body; see `forces.contact_force`."""
+        return forces.contact_force(self.tree, state, water, wrench)
 
     def contact_by_half(
         self, state: State, water: Water
     ) -> tuple[tuple[jax.Array, jax.Array], ...] | None:
-        """Force of the bed on the halves of each module; None for many different robots."""
+        """Force of contacts on the halves of each module; None for many different robots."""
         if not isinstance(self.tree, SingleTree):
             return None
         return forces.contact_by_half(self.tree, state, water)

@@ -23,6 +23,7 @@ times as much.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -100,7 +101,8 @@ def contact_acceleration(
     look_at: Callable[[jax.Array], Robots],
     rows: int,
     dt: float,
-) -> tuple[jax.Array, jax.Array]:
+    felt: int = 0,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Accelerations of robots by contacts of their own modules.
 
     Only robots are looked at that have used up their clearance, a few at a time.
@@ -112,9 +114,10 @@ def contact_acceleration(
         look_at: which lanes, int32 → the robots in them.
         rows: of a response.
         dt: of the step [s].
+        felt: rows of the forces that sensors feel, see `State.pressed`.
 
     Returns:
-        As a response; and the clearance as it is known then.
+        As a response; the clearance as it is known then; and the forces that are felt.
     """
     lanes, dtype, steady = len(clearance), clearance.dtype, meetings.steady
     wanted = (clearance < 0) & (meetings.count > 0)
@@ -122,7 +125,8 @@ def contact_acceleration(
     most = -(-lanes // size)
     # One array: XLA:CPU aborts over a loop of which a part is not used, as the clearance would be
     # where a caller returns positions only.
-    start = jnp.concatenate([jnp.zeros((rows, lanes), dtype), clearance[None]])
+    rest = jnp.zeros((rows + felt, lanes), dtype)
+    start = jnp.concatenate([rest[:rows], clearance[None], rest[rows:]])
 
     def look() -> Any:
         room = jnp.zeros(most * size + 1, jnp.int32), jnp.int32(0)
@@ -131,25 +135,33 @@ def contact_acceleration(
         def visit(k: Any, found: Any) -> Any:
             which = jax.lax.dynamic_slice(listed, (k * size,), (size,))
             real = k * size + jnp.arange(size, dtype=jnp.int32) < count
-            solved, clear = _settle(meetings, which, real, look_at(which), rows, dt)
-            return _put(found, jnp.concatenate([solved, clear[None]]), which, real)
+            solved = _settle(meetings, which, real, look_at(which), rows, dt, felt)
+            return _put(found, solved, which, real)
 
         return _repeat(-(-count // size), most, visit, start, steady)
 
     found: jax.Array = jax.lax.cond(any_lane(wanted), fuse(look), lambda: start)
-    return found[:-1], found[-1]
+    return found[:rows], found[rows], found[rows + 1 :]
 
 
 def _settle(
-    meetings: Meetings, which: jax.Array, real: jax.Array, robots: Robots, rows: int, dt: float
-) -> tuple[jax.Array, jax.Array]:
-    """Accelerations of some robots by their contacts, and the clearance without them.
+    meetings: Meetings,
+    which: jax.Array,
+    real: jax.Array,
+    robots: Robots,
+    rows: int,
+    dt: float,
+    felt: int,
+) -> jax.Array:
+    """Accelerations of some robots by their contacts, the clearance without them, forces felt.
 
     In rounds: contacts are first looked for where bodies would be at unchanged speeds, which is
     where they stay if they press; where they end up elsewhere, further ones are looked for there,
     and join those that push.
     """
     size, steps = len(which), robots.steps
+    bodies = 1 + len(steps)
+    halves = felt > bodies
     zeros = lambda *shape: jnp.zeros((*shape, size), steps.dtype)  # noqa: E731
     none = _Contacts(
         zeros(_MOST),
@@ -157,6 +169,7 @@ def _settle(
         zeros(_MOST, _MOST),
         zeros(_MOST, rows),
         zeros(_MOST),
+        zeros(_MOST, 4 if halves else 2) if felt else None,
     )
 
     def look_again(now: Any) -> Any:
@@ -164,18 +177,14 @@ def _settle(
         change = contacts.acceleration()[6:] - first * robots.hurry
         frames = robots.pose(steps + dt**2 * change)
         kept = weight(contacts.force > 0, clear)
-        table = _find_contacts(meetings, which, moving > 0, frames, kept, dt)
-        touches, near = moving < 0, -first * robots.drift / dt**2
-        for k in range(_MOST):
-            touches = touches | ((table.need[k] > near) & (table.need[k] < _KEPT))
+        table = _find_contacts(meetings, which, moving > 0, frames, kept, dt, halves)
+        near = -first * robots.drift / dt**2
+        touches = _largest(weight((table.need > near) & (table.need < _KEPT), kept)) > 0
 
         def resolve() -> Any:
             found = contacts.join(table, frames[1], robots, change, dt)
-            turned = jnp.abs(found.acceleration()[6:] - change)
-            most = turned[0]
-            for k in range(1, len(turned)):
-                most = jnp.maximum(most, turned[k])
-            return found, weight(dt**2 * most > _TURN, clear)
+            turned = _largest(jnp.abs(found.acceleration()[6:] - change))
+            return found, weight(dt**2 * turned > _TURN, clear)
 
         found, moving = jax.lax.cond(
             any_lane(touches), resolve, lambda: (contacts, jnp.zeros_like(moving))
@@ -188,7 +197,14 @@ def _settle(
 
     start = none, zeros(), weight(real, steps), jnp.ones_like(steps[0])
     contacts, clear, *_ = _loop(_ROUNDS, step, start)
-    return contacts.acceleration(), clear
+    found = [contacts.acceleration(), clear[None]]
+    if contacts.ends is not None:
+        row = jnp.arange(felt, dtype=steps.dtype)[:, None]
+        ends = [contacts.ends[:, k] for k in range(contacts.ends.shape[1])]
+        ends = [x + (bodies if k > 1 else 0) for k, x in enumerate(ends)]
+        at = lambda k: _sum([weight(row == x[k], steps) for x in ends])  # noqa: E731
+        found.append(_sum([contacts.force[k] * at(k) for k in range(_MOST)]))
+    return jnp.concatenate(found)
 
 
 def _put(into: jax.Array, columns: jax.Array, which: jax.Array, real: jax.Array) -> jax.Array:
@@ -279,10 +295,12 @@ def _find_contacts(
     poses: tuple[BodyFrames, BodyFrames],
     kept: jax.Array,
     dt: float,
+    halves: bool,
 ) -> ContactTable:
     """Contacts of some robots: pairs with bounding spheres that overlap at the end of the step.
 
-    None take the places `[_MOST, lanes]` that are 1 in `kept`.
+    None take the places `[_MOST, lanes]` that are 1 in `kept`. `halves`: which halves of modules
+    are in contact is found, too.
     """
     size, dtype, steady = len(which), kept.dtype, meetings.steady
     npair, lanes = meetings.first.shape
@@ -292,6 +310,9 @@ def _find_contacts(
     frames, shapes = materialize(jnp.stack(numbers)), meetings.shapes
     pick = lambda x, k: materialize(take_lanes(x, k))  # noqa: E731
     body = jnp.asarray(meetings.body, jnp.int32)
+    cells = (
+        jnp.asarray(meetings.halves.T, dtype) if halves and meetings.halves is not None else None
+    )
     pairs = [jnp.asarray(x, jnp.int32).reshape(-1) for x in (meetings.first, meetings.second)]
 
     def flat(k: jax.Array, lane: jax.Array, lanes: int) -> jax.Array:
@@ -337,7 +358,12 @@ def _find_contacts(
                 (pick(frames, x.body * size + x.lane), pick(shapes[:-1], x.number)) for x in given
             )
             need, gap, *units = _measure(shown, dt)
-            rest = jnp.stack([*(x.body.astype(dtype) for x in given), *units])
+            found = [*(x.body.astype(dtype) for x in given), *units]
+            if cells is not None:
+                tables = [pick(cells, x.shell) for x in given]
+                ahead = [frame[12:] for frame, _ in shown]
+                found += [_half(*x, units[3:]) for x in zip(tables, ahead, strict=True)]
+            rest = jnp.stack(found)
             left = count - k * _PAIRS
             if steady:
                 listed = jnp.arange(_PAIRS, dtype=jnp.int32) < left
@@ -349,7 +375,9 @@ def _find_contacts(
 
     clear = jnp.full(size, _FAR, dtype)
     table = ContactTable(
-        _NONE + (_KEPT - _NONE) * kept, jnp.zeros((_MOST + 1, 8, size), dtype), clear
+        _NONE + (_KEPT - _NONE) * kept,
+        jnp.zeros((_MOST + 1, 10 if halves else 8, size), dtype),
+        clear,
     )
     room = most * width if steady else min(most * width, _ROOM)
     start = jnp.zeros(room + max(width, _PAIRS), jnp.int32), jnp.int32(0)
@@ -383,7 +411,8 @@ class ContactTable(NamedTuple):
         need: `[_MOST, lanes]` the acceleration along the normal that each needs [m/s²]; not
             positive where boxes stay apart unless other contacts push them together.
         rest: `[_MOST + 1, 8, lanes]` the numbers of both bodies, the normal and the point at the
-            end of the step, root's frame [-, m]; the last contact is none.
+            end of the step, root's frame [-, m]; the last contact is none. Where they are felt
+            there are two further rows, of the halves of modules: 2 module, 1 more to the right.
         clear: `[lanes]` how far at least boxes are apart at the step's end [m].
     """
 
@@ -441,6 +470,13 @@ def _measure(given: tuple[tuple[jax.Array, jax.Array], ...], dt: float) -> Any:
     return fuse(compute)(given)
 
 
+def _half(cells: jax.Array, ahead: jax.Array, point: list[jax.Array]) -> jax.Array:
+    """Which halves of modules points are at; see `ContactTable` and `Meetings.halves`."""
+    way = matvec(ahead[:9].reshape(3, 3, -1), tuple(cells[1:4]))
+    aside = dot(way, tuple(x - p for x, p in zip(point, ahead[9:], strict=True)))
+    return 2 * cells[0] + weight(aside > cells[4], aside)
+
+
 def _insert(
     table: ContactTable, count: Any, found: tuple[jax.Array, ...], lane: jax.Array
 ) -> ContactTable:
@@ -456,7 +492,7 @@ def _insert(
             slot, least = jnp.where(weaker, k, slot), jnp.where(weaker, needs[k], least)
         slot = slot.astype(jnp.int32)
         most = jnp.maximum(need[j], least).reshape(1, 1)
-        new = jax.lax.dynamic_slice(rest, (zero, j), (8, 1))[None]
+        new = jax.lax.dynamic_slice(rest, (zero, j), (len(rest), 1))[None]
         clear = jnp.minimum(table.clear[own], gap[j]).reshape(1)
         # What is not read is written where it stands; what is too weak, behind the others.
         place = jnp.where(need[j] > least, slot, _MOST), zero, own
@@ -483,6 +519,8 @@ class _Contacts(NamedTuple):
         columns: `[_MOST, _MOST, lanes]` of W, of the contacts that take part.
         moved: `[_MOST, rows, lanes]` the responses to unit forces of these.
         force: `[_MOST, lanes]` [N].
+        ends: `[_MOST, 2 or 4, lanes]` numbers of both bodies, and of both halves of modules, see
+            `ContactTable`; None where they are not felt.
     """
 
     need: jax.Array
@@ -490,6 +528,7 @@ class _Contacts(NamedTuple):
     columns: jax.Array
     moved: jax.Array
     force: jax.Array
+    ends: jax.Array | None
 
     def acceleration(self) -> jax.Array:
         """By all contacts, a response."""
@@ -522,7 +561,11 @@ class _Contacts(NamedTuple):
         moved = kept[:, None] * self.moved
         columns = _sum([moved[:, 6 + k][:, None] * x for k, x in enumerate(every)])
         columns = kept[:, None] * (columns + _SOFTNESS * _unit(self.force))
-        contacts = _Contacts(need, levers, columns, moved, kept * self.force)
+        bodies = self.ends
+        if bodies is not None:
+            own = jnp.concatenate([numbers[:, :2], numbers[:, 8:]], 1)
+            bodies = kept[:, None] * bodies + (1 - kept[:, None]) * own
+        contacts = _Contacts(need, levers, columns, moved, kept * self.force, bodies)
         return contacts.solve(robots.make_respond(), dt)
 
     def solve(self, respond: Respond, dt: float) -> _Contacts:
@@ -591,9 +634,7 @@ class _Contacts(NamedTuple):
         missing = self.need - _sum([columns[j] * force[j] for j in range(_MOST)])
         taken = weight(_diagonal(columns) > 0, force)
         missing = (1 - taken) * missing + taken * _NONE
-        worst = missing[0]
-        for k in range(1, _MOST):
-            worst = jnp.maximum(worst, missing[k])
+        worst = _largest(missing)
         return missing, weight(worst * dt**2 > _ENOUGH, worst)
 
 
@@ -609,7 +650,9 @@ def _diagonal(columns: jax.Array) -> jax.Array:
 
 def _sum(xs: list[jax.Array]) -> jax.Array:
     """Written out, as a fused step has no reductions."""
-    total = xs[0]
-    for x in xs[1:]:
-        total = total + x
-    return total
+    return reduce(jnp.add, xs)
+
+
+def _largest(rows: jax.Array) -> jax.Array:
+    """The largest over the first axis, written out, too."""
+    return reduce(jnp.maximum, [rows[k] for k in range(len(rows))])

@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_revolve.body.placement import turned
+from mjx_revolve.engine.assembly import Assembly
 from mjx_revolve.engine.edited_model import edited_constants
 from mjx_revolve.engine.level import Level, PartLaws, Thrusters
 from mjx_revolve.engine.meetings import Boxes, Meetings
@@ -46,6 +48,7 @@ class SingleTree:
         thrusters: of the robot.
         carries: whether any part has added mass.
         shells: the body of each box that can meet others, level after level, as `Meetings.body`.
+        halves: of these boxes, as `Meetings.halves`.
         pairs: `[npair, 2]` boxes that can meet, int32.
         robot: the source.
     """
@@ -62,6 +65,7 @@ class SingleTree:
     thrusters: Thrusters
     carries: bool
     shells: np.ndarray
+    halves: np.ndarray
     pairs: np.ndarray
     robot: Robot
 
@@ -81,7 +85,7 @@ class SingleTree:
         """Which boxes can meet, level after level."""
         first, second = self.pairs.T[..., None]
         boxes = Boxes.of(self.all, like.dtype)
-        return Meetings.of(boxes, self.shells, first, second, True)
+        return Meetings.of(boxes, self.shells, first, second, True, self.halves)
 
     @property
     def touches(self) -> bool:
@@ -259,13 +263,15 @@ def make_single_tree(robot: Robot, contact: bool = True) -> SingleTree:
         hinge_order=np.array([b - 2 for bodies in ids[1:] for b in bodies], np.int32),
         thrusters=read_thrusters(assembly, robot.num_thrusters),
         carries=columns.parts.carried is not None,
-        **_find_meetings(pairs, [rows for *_, rows in made]),
+        **_find_meetings(pairs, [rows for *_, rows in made], assembly, columns.frame),
         robot=robot,
     )
 
 
-def _find_meetings(pairs: np.ndarray, shells: list[np.ndarray]) -> dict[str, np.ndarray]:
-    """Pairs of parts as pairs of the levels' shells, level after level, and the shells' bodies."""
+def _find_meetings(
+    pairs: np.ndarray, shells: list[np.ndarray], assembly: Assembly, frame: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Pairs of parts as pairs of the levels' shells, level after level, their bodies and halves."""
     order = np.concatenate([rows.ravel() for rows in shells])
     starts = np.cumsum([0] + [rows.shape[-1] for rows in shells])
     body = [
@@ -274,7 +280,10 @@ def _find_meetings(pairs: np.ndarray, shells: list[np.ndarray]) -> dict[str, np.
     ]
     place = np.zeros(1 + max(order.max(initial=0), pairs.max(initial=0)), np.int32)
     place[order[order >= 0]] = np.flatnonzero(order >= 0)
-    return {"shells": np.concatenate(body), "pairs": place[pairs]}
+    (right, middle), module = assembly.halves, assembly.layout.module
+    right = turned(frame[assembly.fluid.body].swapaxes(1, 2), right)
+    halves = np.column_stack([module, right, middle])[order]
+    return {"shells": np.concatenate(body), "pairs": place[pairs], "halves": halves}
 
 
 def _make_level(

@@ -51,6 +51,10 @@ class State(NamedTuple):
             empty without added mass and memories.
         clearance: least distance by which boxes of a robot that can meet stay apart, `[lanes]` [m];
             not positive: unknown. Empty without such boxes.
+        pressed: forces along the normals of contacts between the robot's own modules in the last
+            step, `[1 + hinge rows, lanes]` on the rigid bodies, in the order of `Tree.join_rows`
+            [N]; behind them, of one robot, on the left and the right half of each module. Empty
+            where no sensor feels them, see `Engine.with_touch`.
     """
 
     position: Lanes
@@ -63,6 +67,7 @@ class State(NamedTuple):
     command: Any = ()
     submerged: Any = ()
     clearance: Any = ()
+    pressed: Any = ()
 
 
 class RootState(NamedTuple):

@@ -145,6 +145,8 @@ class Rollout:
         """The state before the first step, of an engine's state and a policy's."""
         energy = jnp.zeros_like(self.engine.root(state).angular_velocity[0])
         memory = init_memory(self.signals, self.engine, state, self.context)
+        if "touch" in self.signals or "cells" in self.signals:
+            state = self.engine.with_touch(state)
         return RolloutState(state, controller_state, memory, energy, jnp.zeros((), jnp.int32))
 
     def _seconds(self, steps: Scalar, like: Float[Array, " lanes"]) -> Float[Array, "..."]:

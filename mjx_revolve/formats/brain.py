@@ -39,12 +39,12 @@ READINGS: dict[str, tuple[str, str]] = {
     "force": ("m/s2", "specific force x, y, z, as of an accelerometer: (0, 0, 9.81) at rest"),
     "load": ("N m", "torque of each hinge's servo"),
     "work": ("J", "work that servos and propellers have done since the start"),
-    "touch": ("N", "force of the bed on the core's rigid body, then on what each hinge carries"),
+    "touch": ("N", "force of contacts on the core's rigid body, then on what each hinge carries"),
     "nearest_toward": ("m", "to the nearest other robot x, y, z"),
     "nearest_tag": ("-", "the number that identifies the nearest other robot"),
     "course": ("-", "the direction to keep to x, y, z, of length 1"),
     "seen": ("-", "1 while the target is seen, else 0"),
-    "cells": ("N", "force of the bed on the left and the right half"),
+    "cells": ("N", "force of contacts on the left and the right half"),
 }
 """Unit and meaning of the fields of `SensorReadings`; vectors are in the frame of where they are
 measured: the core, or a module's main box."""
@@ -55,7 +55,7 @@ _AT_MODULE = {
     "angle": "angle of its hinge, 0 in the rest pose",
     "speed": "angular velocity of its hinge",
     "load": "torque of its hinge's servo",
-    "touch": "force of the bed on its rigid body",
+    "touch": "force of contacts on its rigid body",
 }
 
 

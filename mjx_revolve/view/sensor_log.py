@@ -15,12 +15,16 @@ from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.control.readings import EpisodeContext, SensorReadings
 from mjx_revolve.control.sensors import Observation, Observer, count_samples
 from mjx_revolve.engine.plant import actuators_of
+from mjx_revolve.engine.state import State
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.fitness import Fitness
 from mjx_revolve.episodes.rollout import Rollout, RolloutState, StepInputs, with_variation
 from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.numerics.xla import jit
 from mjx_revolve.water.flow import water_of
+
+# The fields of a state that a trajectory has.
+_POSE = ("position", "quat", "velocity", "angular_velocity", "angle", "speed")
 
 
 class SensorTrace(NamedTuple):
@@ -175,8 +179,14 @@ def _compiled(fitness: Fitness, steps: int) -> Any:
         def step(now: RolloutState, k: jax.Array) -> PyTree:
             own = jax.tree.map(lambda x: x[k][None], water)
             inputs = StepInputs(own, engine.plant.arrange(ctrl[k][:, None]))
-            (seen, *found), command, _, motion = rollout.act(now, inputs)
-            then = rollout.update(now, state_at(k + 1), power[k][None], (seen,), command, motion)
+            (seen, *found), command, around, motion = rollout.act(now, inputs)
+            state = state_at(k + 1)
+            if isinstance(now.state, State) and len(now.state.pressed):
+                # Forces of the robot's own modules on each other do not follow from its pose.
+                rest = engine.step(now.state, command, around)[0]._asdict()
+                pose = {key: value for key, value in state._asdict().items() if key in _POSE}
+                state = State(**rest | pose)
+            then = rollout.update(now, state, power[k][None], (seen,), command, motion)
             return then, found
 
         state = state_at(0)

@@ -1,5 +1,6 @@
 """Self-contact: depth, momentum, energy, mirrors, batches, MuJoCo's contacts, random bodies."""
 
+import itertools
 import re
 from functools import lru_cache
 
@@ -16,8 +17,9 @@ from laboratory import QUICK, at_rest, body, limp
 from mjx_revolve import load_world
 from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
+from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.engines import make_engine
-from mjx_revolve.engine.population import make_population_engine
+from mjx_revolve.engine.population import PopulationEngine, make_population_engine
 from mjx_revolve.engine.robot import build_robot, check_timestep
 from mjx_revolve.engine.self_overlap import self_overlap
 from mjx_revolve.engine.self_pairs import candidate_pairs
@@ -156,6 +158,96 @@ def test_contact_keeps_momentum_and_takes_energy():
         assert np.abs(change).max() < 1e-11 * max(size, 1e-3)
         taken = momentum(robot, qpos[:, k], after[:, k])[1]
         assert taken < momentum(robot, qpos[:, k], alone[:, k])[1]
+
+
+def feel(make, qpos, ctrl, wrench, steps):
+    """After so many steps from rest: qpos, servo torques, and what contacts do to bodies, and to
+    halves of modules, and to bodies under a wrench."""
+    with jax.enable_x64(True):
+
+        def run(qpos, wrench):
+            engine, calm = make(), water_of(load_world("lake", **EMPTY))
+            arranged = engine.plant.arrange(jnp.asarray(ctrl))
+            state = engine.with_touch(engine.init(qpos, jnp.zeros_like(qpos[1:])))
+            step = lambda _, now: engine.step(now, arranged, calm)[0]  # noqa: E731
+            state = jax.lax.fori_loop(0, steps, step, state)
+            forces = [engine.contact_force(state, calm, x) for x in ((), wrench)]
+            torque = engine.servo_torque(state, arranged)
+            halves = engine.contact_by_half(state, calm)
+            return engine.observe(state)[0], torque, forces[0], halves, forces[1]
+
+        found = jax.jit(run, compiler_options=QUICK)(jnp.asarray(qpos, float), wrench)
+        return jax.tree.map(np.asarray, found)
+
+
+def two_jaws(robot):
+    """An open jaw and its mirror image."""
+    qpos, _ = open_jaw(robot, 2)
+    qpos[7:, 1] = -qpos[:6:-1, 0]
+    return qpos
+
+
+@pytest.mark.slow
+def test_touch_sensors_feel_the_robots_own_modules():
+    robot = jaw(**EMPTY)
+    ctrl = np.tile(INWARDS, 2)
+    rest, torque, touch, halves, _ = feel(
+        lambda: make_engine(robot), two_jaws(robot), ctrl, (), 400
+    )
+    assert not touch[0].any()
+    np.testing.assert_array_equal(touch[1], touch[2])
+    # The arm that is not at its end stop rests between its servo and the other arm.
+    model, data = robot.mj_model, mujoco.MjData(robot.mj_model)
+    data.qpos[:] = rest[:, 0]
+    mujoco.mj_forward(model, data)
+    arms = [np.flatnonzero(model.geom_bodyid == body) for body in (2, 3)]
+    ends, gaps = np.zeros((2, 3)), {}
+    for pair in itertools.product(*arms):
+        gaps[pair] = mujoco.mj_geomDistance(model, data, *pair, 0.01, None)
+    mujoco.mj_geomDistance(model, data, *min(gaps, key=gaps.get), 0.01, ends.ravel())
+    normal = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    free = int(np.abs(rest[7:, 0]).argmin())
+    arm = ends.mean(0) - data.xanchor[1 + free]
+    lever = abs(normal @ np.cross(data.xaxis[1 + free], arm))
+    assert touch[1, 0] * lever == pytest.approx(np.abs(torque[free, 0]), rel=0.01)
+    # The tip of the right arm, which looks ahead, is pressed on its left half.
+    pressed = np.array(halves)
+    left, right = 6, 12
+    if data.xpos[2, 0] > data.xpos[3, 0]:
+        left, right = right, left
+    for lane in range(2):
+        expected = np.zeros((13, 2))
+        expected[right, 0] = expected[left, 1] = touch[1, lane]
+        np.testing.assert_array_equal(pressed[..., lane], expected)
+
+
+@pytest.mark.slow
+def test_different_bodies_feel_themselves_and_others_as_one_alone_does():
+    robot = jaw(**EMPTY)
+    robots = [robot, build_robot(body("spider"), robot.world), robot]
+    capacity = fit_capacity(robots)
+    bodies = pack_bodies(robots, capacity, np.float64)
+    qpos, ctrl = np.zeros((7 + capacity.hinges, 3)), np.zeros((capacity.hinges, 3))
+    qpos[:, 1] = at_rest(robots[1], 1, -2.0)[0][: len(qpos), 0]
+    qpos[:9, [0, 2]], ctrl[:2, [0, 2]] = two_jaws(robot), INWARDS
+    alone = feel(lambda: make_engine(robot), qpos[:9, [0, 2]], ctrl[:2, [0, 2]], (), 100)
+    hinge = np.asarray(bodies.plant.source[: capacity.rows])
+    push = (np.zeros((1, 3)), np.zeros((1, 3)), np.full((1, 3), -4.0))
+    aside = (0.0 * hinge[:, None], 3.0 * (hinge == 1)[:, None], 0.0 * hinge[:, None])
+    wrench = ((push, push), (aside, aside))
+
+    def many():
+        plant = jax.tree.map(jnp.asarray, bodies.plant)
+        return PopulationEngine(make_batched_trees(robot.world, capacity, bodies, 3), plant)
+
+    _, _, touch, _, pushed = feel(many, qpos, ctrl, wrench, 100)
+    assert not touch[:, 1].any()
+    for lane, own in ((0, 0), (2, 1)):
+        for row, force in enumerate(alone[2][1:, own]):
+            found = touch[1:][hinge[:, lane] == row, lane]
+            assert force > 1 and found == pytest.approx(force, rel=1e-9)
+        assert (pushed - touch)[0, lane] == pytest.approx(4)
+        assert (pushed - touch)[1:, lane] == pytest.approx(3.0 * (hinge[:, lane] == 1), abs=1e-9)
 
 
 def march_batch(robots, capacity, lanes, ctrl, steps):
