@@ -59,8 +59,23 @@ def test_defaults(folder):
 ("task.settle=10", "task.settle: expected a time below task.duration (10 s); found 10"),
 ("task.type=swim", f"task.type: expected one of {', '.join(config.TASKS)}, or "
          "FILE.py:FUNCTION; found 'swim'"),
+("task.type=follow_bed", "task.height: expected a number > 0 [m], because task.type is "
+         "follow_bed; found none"),
+("task.params={a: 1}", "task.params: expected none, as only own functions take them; "
+         "found a"),
+("task={type: reach_target, target: [1, 0, 0], target_distance: 1}", "task.target: "
+         "expected none, as there is a target_distance; found one"),
+("task={type: speed, target_speed: 1, target_turn: 1}", "task.target: expected three "
+         "numbers [m], or target_distance, as there is a target_turn; found none"),
+("task={type: follow_course, course_spread: 1, direction: [0, 0, 1]}", "task.direction: "
+         "expected one that is not upright, as there is a course_spread, which is level; found"),
+("controller.harmonics=3", "--set controller.harmonics: expected 1, as only type sine has "
+         "it (--set controller.harmonics=1); found 3"),
 ("controller.sensors=[gyro]", "--set controller.sensors: expected null, as only types mlp, "
          "rnn, sensory_cpg have it (--set controller.sensors=null); found 1 of them"),
+("task.direction=[0, 0, 0]", "task.direction: expected a vector of some length; found"),
+("task={type: speed, duration: 6, horizon: 3}", "--set task.horizon: expected a time >= "
+         "task.duration (6 s); found 3"),
 ("task.durtion=5", "--set task.durtion: expected one of 32 keys; found an unknown key; "
          "did you mean task.duration?"),
 ("wrld=lake", "found an unknown key; did you mean world?"),

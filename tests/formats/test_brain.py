@@ -26,7 +26,6 @@ from mjx_revolve.episodes.fitness import make_fitness
 from mjx_revolve.episodes.rollout import Rollout
 from mjx_revolve.formats.brain import _list_readings, champion_brain, make_brain
 from mjx_revolve.formats.brain_c import make_brain_c
-from mjx_revolve.formats.brain_program import find_view, split_runs
 from mjx_revolve.formats.brain_python import make_brain_python
 from mjx_revolve.formats.brain_ros import make_brain_node
 from mjx_revolve.inputs.errors import InputError
@@ -204,23 +203,6 @@ def clipped(brain, ctrl):
 def quick():
     with compiled_quickly():
         yield
-
-
-def test_indices_as_views_and_runs():
-    draw = np.random.default_rng(0)
-    cases = [np.arange(3, 9), np.arange(0, 12, 3), np.repeat(np.arange(2, 5), 4),
-             np.tile(np.arange(1, 4), 3), np.full(5, 2), np.array([4])]  # fmt: skip
-    for index in cases:
-        view = find_view(tuple(index))
-        at = np.arange(len(index)) // view.run
-        at = at % view.period if view.period else at
-        np.testing.assert_array_equal(view.start + view.step * at, index)
-    for _ in range(50):
-        index = draw.integers(0, 6, draw.integers(1, 12))
-        runs = split_runs(tuple(index))
-        assert [first for first, *_ in runs] == np.cumsum([0, *(n for *_, n in runs[:-1])]).tolist()
-        again = np.concatenate([np.arange(start, start + n) for _, start, n in runs])
-        np.testing.assert_array_equal(again, index)
 
 
 KINDS = [*CONTROLLERS, "mine.py:matrix"]

@@ -199,28 +199,6 @@ def test_cells_of_the_archive_are_links(tmp_path, still):
     assert "<?xml" not in page and page.count("<svg") == 1
 
 
-def test_pages_that_are_there_stay(run, monkeypatch):
-    asked = []
-
-    def load(folder, numbers):
-        asked.append(list(numbers))
-        return [f"episode {number}" for number in numbers]
-
-    def write(episode, path, forces):
-        assert not forces
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(episode)
-
-    monkeypatch.setattr(report_bodies, "load_individuals", load)
-    monkeypatch.setattr(report_bodies, "write_viewer", write)
-    record = read_run(run)
-    assert report_bodies.write_pages(record, [5, 3]) == 2
-    assert report_bodies.write_pages(record, [3, 4]) == 1
-    assert report_bodies.write_pages(record, [3, 4]) == 0
-    assert asked == [[5, 3], [4]]
-    assert (run / "individuals/4.html").read_text() == "episode 4"
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("damage", "message"),
