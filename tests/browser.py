@@ -4,11 +4,7 @@ No driver and no package is needed, only a Chromium or Chrome on the path. Each 
 that ends in a zero byte (`--remote-debugging-pipe`).
 """
 
-from __future__ import annotations
-
-import base64
 import fcntl
-import io
 import json
 import os
 import select
@@ -18,10 +14,9 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Self
 
-import numpy as np
 import pytest
-from PIL import Image
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 # WebGL 2 without a graphics card.
@@ -52,10 +47,6 @@ def find_browser() -> str | None:
     return next((path for name in _NAMES if (path := shutil.which(name))), None)
 
 
-_PANELS = (
-    "[...document.querySelectorAll('.glass:not([hidden])')].map((e) => e.getBoundingClientRect())"
-    ".filter((b) => b.width > 0).map((b) => [b.left, b.top, b.right, b.bottom])"
-)
 needs_browser = pytest.mark.skipif(
     find_browser() is None, reason="no chromium or chrome on the path to open the page with"
 )
@@ -100,7 +91,7 @@ class Browser:
             self.send(f"{domain}.enable")
         self.resize(width, height)
 
-    def __enter__(self) -> Browser:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -192,47 +183,6 @@ class Browser:
         self.send("Input.dispatchKeyEvent", type="keyDown", key=key, **text)
         self.send("Input.dispatchKeyEvent", type="keyUp", key=key)
 
-    def mouse(self, kind: str, x: float, y: float, **more) -> None:
-        """One event of the mouse: mousePressed, mouseMoved, mouseReleased, mouseWheel."""
-        self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
-
-    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        """Drags with the left button."""
-        self.mouse("mousePressed", *start, button="left", buttons=1, clickCount=1)
-        for share in (0.3, 0.6, 1.0):
-            at = [a + share * (b - a) for a, b in zip(start, end, strict=True)]
-            self.mouse("mouseMoved", *at, button="left", buttons=1)
-        self.mouse("mouseReleased", *end, button="left", clickCount=1)
-
-    def click(self, selector: str) -> None:
-        """Clicks the middle of an element."""
-        box = self.evaluate(
-            f"(() => {{ const b = document.querySelector({json.dumps(selector)})"
-            ".getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; })()"
-        )
-        self.mouse("mousePressed", *box, button="left", clickCount=1)
-        self.mouse("mouseReleased", *box, button="left", clickCount=1)
-
-    def picture(self) -> np.ndarray:
-        """What the page shows once all is drawn, `[rows, columns, 3]` from 0 to 255."""
-        self.evaluate(
-            "window.done = false;"
-            "requestAnimationFrame(() => requestAnimationFrame(() => window.done = true))"
-        )
-        self.wait("window.done")
-        data = base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"])
-        return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), float)
-
     def fact(self, name: str) -> str | None:
         """What the page says of itself: time, frames, playing, and others."""
         return self.evaluate(f"document.documentElement.dataset.{name} ?? null")
-
-    def check_panels(self, *sizes: tuple[int, int]) -> None:
-        """Panels lie in the window and not over each other, in windows of these sizes."""
-        for size in sizes:
-            self.resize(*size)
-            panels = np.array(self.evaluate(_PANELS))
-            low = np.maximum(panels[:, None, :2], panels[:, :2])
-            high = np.minimum(panels[:, None, 2:], panels[:, 2:])
-            assert ((low < high).all(-1) == np.eye(len(panels), dtype=bool)).all(), size
-            assert panels.min() >= 0 and (panels[:, 2:] <= size).all(), size

@@ -1,7 +1,5 @@
 """Fixtures that several files share; whatever compiles is made once for the whole session."""
 
-from __future__ import annotations
-
 import atexit
 import gc
 import os
@@ -52,12 +50,6 @@ def arm():
 
 
 @pytest.fixture(scope="session")
-def wet_arm():
-    """The same in water, 1 m or more from any surface it can reach."""
-    return arm_robot(world(**WATER))
-
-
-@pytest.fixture(scope="session")
 def elbow():
     """The smallest body with two hinges, in water."""
     return elbow_robot(world(**WATER))
@@ -83,15 +75,16 @@ def fresh_traces():
     jax.clear_caches()
 
 
-# Files are dealt out whole, in this order: those that take half a minute or more go first, so that
-# no worker is left alone with one at the end.
+# Files are dealt out whole, in this order: those that take longest go first, so that no worker is
+# left alone with one at the end.
 _LONGEST = (
-    "test_many_bodies", "test_end_to_end", "test_dynamics", "test_mjx_contact", "test_rollout",
-    "test_executor", "test_step", "test_evolve", "test_report", "test_coevolution", "test_fitness",
-    "test_cluster", "test_studies", "test_surface_tension", "test_own_code", "test_buoyancy",
-    "test_bodies", "test_thrust_step", "test_water", "test_docs", "test_loop", "test_brain",
-    "test_sweep", "test_forces", "test_swim_picture", "test_lift_drag", "test_bodies_end_to_end",
-    "test_contact", "test_tasks", "test_windows",
+    "test_many_bodies", "test_examples", "test_end_to_end", "test_executor", "test_docs",
+    "test_dynamics", "test_brain", "test_coevolution", "test_step", "test_bodies_end_to_end",
+    "test_rollout", "test_mjx_contact", "test_cluster", "test_report", "test_tasks",
+    "test_vector_env", "test_self_contact", "test_collisions", "test_forces",
+    "test_sensory_brains", "test_windows", "test_tank", "test_colony", "test_wakes",
+    "test_lift_drag", "test_buoyancy", "test_water", "test_contact", "test_surface_tension",
+    "test_thrust_step", "test_sweep", "test_fitness", "test_swim_picture", "test_assembly",
 )  # fmt: skip
 
 

@@ -1,7 +1,5 @@
 """Robots to export: the shipped ones, and an odd one; their poses by MuJoCo."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import mujoco

@@ -4,8 +4,6 @@ Everything here runs the package's own step, in float64, so that tolerances can 
 discretisation errs by and not what float32 rounds to.
 """
 
-from __future__ import annotations
-
 import copy
 import os
 import tempfile

@@ -5,8 +5,6 @@ what became of it. `make fuzz` looks for more of them, and longer (`MJX_REVOLVE_
 each test, drawn anew); without it the examples are few, and the same each time.
 """
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import io
@@ -48,9 +46,6 @@ def fuzz(examples: int) -> settings:
         print_blob=bool(HUNT),
         report_multiple_bugs=False,
     )
-
-
-# --- values ---------------------------------------------------------------------------------------
 
 
 class Raw(str):
@@ -132,9 +127,6 @@ def _escape(character: str) -> str:
         return character
     number = ord(character)
     return f"\\U{number:08x}" if number > 0xFFFF else f"\\u{number:04x}"
-
-
-# --- files ----------------------------------------------------------------------------------------
 
 
 class Mutant(NamedTuple):
@@ -289,9 +281,6 @@ def wrecks(draw: Callable, *contents: bytes) -> Mutant:
 
 def _as_bytes(text: str) -> bytes:
     return text.encode(errors="surrogatepass")
-
-
-# --- what must be true ----------------------------------------------------------------------------
 
 
 class Accepted(BaseException):

@@ -1,7 +1,5 @@
 """Independent references in float64 NumPy: what the package computes, by another road."""
 
-from __future__ import annotations
-
 import itertools
 
 import mujoco

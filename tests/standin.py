@@ -1,7 +1,5 @@
 """A stand-in for a running world: robots swim straight ahead and wave their hinges, by formula."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

@@ -1,13 +1,10 @@
 """The command line with the real robot: what a new user types, and what comes out."""
 
-from __future__ import annotations
-
 import csv
 import shutil
 import subprocess
 import sys
 
-import av
 import mujoco
 import numpy as np
 import pytest
@@ -15,8 +12,6 @@ import yaml
 
 from laboratory import ROOT
 from mjx_revolve.evolution.run_folder import RunFolder
-from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.film.opengl import find_opengl
 from toys import CLOCK
 
 
@@ -92,19 +87,6 @@ def test_the_shipped_auv_holds_its_depth_as_its_file_says(tmp_path):
     """With a seed that used to learn nothing; without thrust it scores -1.7 body lengths."""
     command("evolve", "auv_hold_depth", "--seed", 4, "--out", tmp_path / "auv")
     assert -0.06 < yaml.safe_load((tmp_path / "auv/champion/genes.yaml").read_text())["score"] < 0
-
-
-@pytest.mark.long
-def test_the_film_of_a_run(smoke):
-    try:
-        find_opengl()
-    except InputError as error:
-        pytest.skip(str(error))
-    command("replay", smoke, "--size", "320x240")
-    with av.open(smoke / "swim.mp4") as film:
-        assert sum(1 for _ in film.decode(video=0)) == 30
-    assert (smoke / "swim.gif").stat().st_size < 8e6
-    assert (smoke / "viewer.html").stat().st_size < 5e6
 
 
 def test_wrong_input_is_one_line_and_code_2():

@@ -1,7 +1,5 @@
 """Each script in `examples/` and each notebook runs as it stands; scripts stay short."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import json

@@ -1,20 +1,15 @@
 """The command line that shows a morphology, and its picture."""
 
-from __future__ import annotations
-
 import os
-import subprocess
-import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import yaml
 
 from laboratory import ROOT
 from mjx_revolve import inspect
 from mjx_revolve.body.morphology import load_morphology
-from mjx_revolve.body.table import module_table, summary, thruster_table
+from mjx_revolve.body.table import thruster_table
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 
@@ -73,51 +68,6 @@ def test_the_spider_weighs_what_the_thesis_says(spider, capsys):
     assert "(sinks)" in out
 
 
-def test_the_table_is_aligned_with_units_in_its_header(spider):
-    lines = module_table(load_morphology(spider))
-    assert len(lines) == 2 + 17
-    assert lines[0].split() == [
-        "#", "name", "type", "parent", "slot", "turn", "x", "y", "z", "mass", "volume"
-    ]  # fmt: skip
-    assert lines[1].split() == ["(deg)", "(m)", "(m)", "(m)", "(kg)", "(cm³)"]
-    assert len({len(line) for line in lines}) == 1  # the last column is set to the right
-    # The foot along +x: x .17905, as in Revolve's SDF; brick 10.70 cm³, .0102 kg.
-    foot = next(line.split() for line in lines if " foot2 " in line)
-    assert foot[2:] == [
-        "FixedBrick", str(int(foot[0]) - 1), "1", "0", "0.17905", "0.00000", "0.00000",
-        "0.0102", "10.700",
-    ]  # fmt: skip
-    core = lines[2].split()
-    assert core == ["0", "core", "Core", "-", "-", "-", *["0.00000"] * 3, "0.0900", "50.540"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "buoyancy", "net", "verdict"),
-    [
-        (("--density", "1025"), 2.4285, 0.0946, "sinks"),
-        (("--density", "1200"), 2.8431, -0.3200, "floats"),
-        (("--gravity", "1.62"), 0.3909, 0.0258, "sinks"),
-    ],
-)
-def test_density_and_gravity_change_the_weights(spider, capsys, arguments, buoyancy, net, verdict):
-    assert run(spider, *arguments) == 0
-    out = capsys.readouterr().out
-    assert _value(out, f"buoyancy in water of {_density(arguments):g} kg/m³") == pytest.approx(
-        buoyancy, abs=1e-4
-    )
-    assert _value(out, "net weight in water") == pytest.approx(net, abs=1e-4)
-    assert f"({verdict})" in out
-
-
-def _density(arguments: tuple[str, str]) -> float:
-    return float(arguments[1]) if arguments[0] == "--density" else 999.1026
-
-
-def test_a_neutral_robot_is_called_neutral(spider):
-    body = load_morphology(spider)
-    assert any("(neutral)" in line for line in summary(body, body.mass / body.volume, 9.81))
-
-
 def test_descriptors_are_listed(spider, capsys):
     assert run(spider) == 0
     out = capsys.readouterr().out
@@ -156,39 +106,6 @@ def test_centres_of_mass_and_volume_are_shown(spider, capsys):
     assert (_value(out, "thrusters"), _value(out, "fins"), _value(out, "hinges")) == (0, 3, 3)
 
 
-def test_own_module_types_are_read(tmp_path, capsys):
-    (tmp_path / "mine.yaml").write_text(
-        "modules:\n  Flipper:\n    mount: -x\n"
-        "    parts:\n      - {size: [.06, .04, .002], mass: .006, volume: 4.0e-6}\n"
-    )
-    (tmp_path / "robot.yaml").write_text(
-        "id: fish\nbody:\n  id: core\n  type: Core\n  children:\n    1: {id: fin, type: Flipper}\n"
-    )
-    assert run(tmp_path / "robot.yaml", "--modules", tmp_path / "mine.yaml") == 0
-    assert _value(capsys.readouterr().out, "mass") == pytest.approx(0.096)
-    assert run(tmp_path / "robot.yaml") == 2
-    assert "Flipper" in capsys.readouterr().err
-
-
-def test_overlap_is_refused_unless_allowed(tmp_path, capsys):
-    """Four bricks in a ring come back to where they began."""
-    brick: dict = {"id": "d", "type": "FixedBrick"}
-    for name in "cba":
-        brick = {"id": name, "type": "FixedBrick", "children": {2: brick}}
-    hub = {"id": "hub", "type": "FixedBrick", "children": {2: brick}}
-    path = tmp_path / "ring.yaml"
-    path.write_text(yaml.safe_dump({"id": "ring", "body": {
-        "id": "core", "type": "Core", "children": {1: hub}}}))  # fmt: skip
-    assert run(path) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ") and error.count("\n") == 1
-    assert run(path, "--allow-overlap") == 0
-    assert "overlap at rest" in capsys.readouterr().out
-
-
-# --- the picture --------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_the_picture_is_a_whole_png_in_the_robots_colours(spider, tmp_path):
     from matplotlib.image import imread
@@ -208,87 +125,16 @@ def test_the_picture_is_a_whole_png_in_the_robots_colours(spider, tmp_path):
     assert 0.3 < white.mean() < 0.9
 
 
-@pytest.mark.slow
-def test_thrusts_are_drawn_as_green_arrows(tmp_path):
-    from matplotlib.image import imread
-
-    share = {}
-    for name in ("auv", "fish"):
-        assert run(ROOT / "morphologies" / f"{name}.yaml", "--picture", tmp_path / "a.png") == 0
-        red, green, blue = np.moveaxis(imread(tmp_path / "a.png")[..., :3], -1, 0)
-        share[name] = ((green > 1.6 * red) & (green > 1.6 * blue) & (green > 0.3)).mean()
-    assert share["auv"] > 1e-3
-    assert share["fish"] == 0.0
-
-
-@pytest.mark.parametrize("name", ["Thruster", "LiftThruster", "Fin"])
-def test_thrusters_and_fins_have_shapes_of_their_volume_within_their_box(name):
-    from mjx_revolve.body.catalogue import MODULES
-    from mjx_revolve.body.solids import part_mesh
-
-    kind = MODULES[name]
-    (part,) = kind.parts
-    mesh = part_mesh(kind, part)
-    assert mesh.is_watertight and mesh.is_winding_consistent
-    assert mesh.volume == pytest.approx(part.volume, rel=1e-9)
-    assert mesh.bounds == pytest.approx(np.array(part.bounds), abs=1e-9)
-
-
-def test_an_arrow_is_closed_and_points_along_its_axis():
-    import trimesh
-
-    from mjx_revolve.view.pieces import _spindle
-
-    corners = _spindle((0, 0, 2), [(0.0, 0.0), (0.0, 1.0), (3.0, 1.0), (3.0, 2.0), (5.0, 0.0)])
-    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
-    mesh.merge_vertices()
-    hexagon = 1.5 * np.sqrt(3)
-    assert mesh.volume == pytest.approx(hexagon * 3 + 4 * hexagon * 2 / 3)
-    assert mesh.bounds[:, 2] == pytest.approx([0.0, 5.0])
-
-
-def test_what_is_nearer_hides_what_is_farther():
-    from mjx_revolve.view.raster import depth_buffer
-
-    square = np.array([[(0, 0), (4, 0), (4, 4)], [(0, 0), (4, 4), (0, 4)]], float)
-    low = np.concatenate([square, np.zeros((2, 3, 1))], axis=2)
-    high = np.concatenate([0.5 * square + 1, np.ones((2, 3, 1))], axis=2)
-    for corners, near in ((np.concatenate([low, high]), 2), (np.concatenate([high, low]), 0)):
-        depth, index = depth_buffer(corners, np.zeros(2), 0.1, (40, 40))
-        assert (depth[10:30, 10:30] == 1.0).all()
-        assert (depth == 1.0).sum() == 400 and (depth == 0.0).sum() == 1200
-        assert np.isin(index[10:30, 10:30], (near, near + 1)).all()
-    depth, _ = depth_buffer(low[:, ::-1], np.zeros(2), 0.1, (40, 40))
-    assert not np.isfinite(depth).any()  # faces that look away are not drawn
-
-
-@pytest.mark.slow
-def test_drawing_leaves_matplotlib_alone():
-    code = (
-        "import sys, matplotlib; before = matplotlib.rcParams.copy(); "
-        "import mjx_revolve.view.pictures; "
-        "sys.exit('matplotlib.pyplot' in sys.modules or before != matplotlib.rcParams)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False, cwd=ROOT).returncode == 0
-
-
-# --- refusals -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--density", "heavy"),
+(("--density", "heavy"),
          "--density: expected a number > 0 [kg/m3]; found 'heavy' (see --help)"),
-        (("--gravity", "-9.81"),
-         "--gravity: expected a number > 0 [m/s2]; found '-9.81' (see --help)"),
-        (("--picture", "{tmp}/none/a.png"),
+(("--picture", "{tmp}/none/a.png"),
          "{tmp}/none/a.png: expected the folder {tmp}/none to exist; found none"),
-        (("--picture", "{tmp}/a.jpg"), "{tmp}/a.jpg: expected a name that ends in .png; found "
-         "'.jpg'"),
-        (("--picture", "{tmp}/folder.png"), "{tmp}/folder.png: expected a file; found a folder"),
-        (("--modules", "{tmp}/none.yaml"), "{tmp}/none.yaml: expected a file; found none"),
-    ],
+(("--picture", "{tmp}/a.jpg"), "{tmp}/a.jpg: expected a name that ends in .png; found "
+         "'.jpg'")
+],
 )  # fmt: skip
 def test_bad_arguments_are_one_line_and_code_2(spider, tmp_path, capsys, arguments, message):
     (tmp_path / "folder.png").mkdir()
@@ -298,33 +144,6 @@ def test_bad_arguments_are_one_line_and_code_2(spider, tmp_path, capsys, argumen
     assert captured.err == f"error: {message.format(tmp=tmp_path)}\n"
     assert captured.out == ""
     assert sorted(os.listdir(tmp_path)) == before
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (None, "expected a file; found none"),
-        ("body: [", "expected valid YAML"),
-        ("id: x\n", "body"),
-        ("body: {id: c, type: Bric}\n", "'Bric'"),
-    ],
-)
-def test_bad_files_are_one_line_and_code_2(tmp_path, capsys, text, message):
-    path = tmp_path / "robot.yaml"
-    if text is not None:
-        path.write_text(text)
-    assert run(path) == 2
-    captured = capsys.readouterr()
-    assert captured.err.startswith(f"error: {path}: ")
-    assert message in captured.err and captured.err.count("\n") == 1
-    assert captured.out == ""
-
-
-def test_without_a_file_the_command_says_so(capsys):
-    assert run() == 2
-    assert capsys.readouterr().err == (
-        "error: the following arguments are required: file (see --help)\n"
-    )
 
 
 def test_a_picture_that_cannot_be_written_leaves_nothing(spider, tmp_path, monkeypatch):
@@ -342,21 +161,3 @@ def test_a_picture_that_cannot_be_written_leaves_nothing(spider, tmp_path, monke
     with pytest.raises(InputError, match="expected a writable file; found No space left on device"):
         pictures.draw_morphology(load_morphology(spider), picture)
     assert os.listdir(tmp_path) == ["spider.yaml"]
-
-
-def test_the_module_runs_as_a_command(spider):
-    done = subprocess.run(
-        [sys.executable, "-m", "mjx_revolve.inspect", str(spider)],
-        capture_output=True, text=True, check=False, cwd=ROOT,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert "17" in done.stdout and done.stderr == ""
-
-
-@pytest.mark.parametrize("name", ["spider", "gecko", "snake", "babyA", "robot_5", "spider17"])
-def test_robots_in_the_wild_are_shown(name, capsys):
-    path = ROOT.parent / "shared" / "revolve_robots" / f"{name}.yaml"
-    if not path.exists():
-        pytest.skip("no collection of Revolve's robots beside the repository")
-    assert run(path) == 0
-    assert len(capsys.readouterr().out.splitlines()) > 20

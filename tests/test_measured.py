@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments import measured, measured_cases
+from experiments import measured_cases
 from experiments import measured_data as data
 
 
@@ -19,22 +19,6 @@ def steady():
 @pytest.fixture(scope="module")
 def on_faces():
     return measured_cases.steady_drag("faces")
-
-
-def test_drag_on_faces_is_near_that_of_plates_and_far_from_that_of_long_rods(on_faces):
-    steady = on_faces
-    found = ratios(steady.rows)
-    for name in ("square plate, broadside", "disc, broadside"):
-        assert 0.85 < found[name] < 1.0
-    # A rod has no ends to flow around; faces at 45° meet half of the speed squared each.
-    assert 0.5 < found["square rod, face on"] < 0.55
-    assert 0.3 < found["square rod, edge on"] < 0.35
-    # Not a bluff body.
-    assert 3.0 < found["REMUS 100, ahead"] < 3.4
-    angle, ours = steady.lines["rod"]
-    turn = np.radians(angle)
-    by_hand = 1.05 * (np.cos(turn) ** 3 + np.sin(turn) ** 3) / (np.cos(turn) + np.sin(turn))
-    np.testing.assert_allclose(ours, by_hand, rtol=1e-9)
 
 
 def test_a_rod_meets_what_a_rod_meets(steady, on_faces):
@@ -73,29 +57,6 @@ def test_plates_lift_as_measured_before_they_stall(polars):
     assert 1.5 < ratios(polars.rows)["lift, aspect 2, 25°"] < 1.9
 
 
-def test_plates_drag_too_little_beyond_fifteen_degrees(polars):
-    for what, share in ratios(polars.rows).items():
-        if what.startswith("drag") and not what.endswith(" 10°"):
-            assert 0.4 < share < 0.7
-
-
-@pytest.mark.slow
-def test_coins_fall_as_fast_as_measured_and_far_too_straight():
-    for row in measured_cases.coins("faces").rows:
-        if row.unit == "m/s":
-            assert 0.9 < row.ratio < 1.25
-        else:
-            assert row.ratio < 0.05  # they do not glide: faces have no lift
-
-
-@pytest.mark.slow
-def test_a_chain_of_faces_glides_and_turns_too_far():
-    found = ratios(measured_cases.amphibot_glide("faces").rows)
-    assert found["glide, way after 0.13 s"] == pytest.approx(1.0, abs=0.05)
-    assert found["glide, way after 4.4 s"] == pytest.approx(1.14, abs=0.01)
-    assert found["glide, rotation after 4.4 s"] == pytest.approx(2.7, abs=0.02)
-
-
 @pytest.mark.slow
 def test_a_chain_glides_as_far_as_measured():
     found = ratios(measured_cases.amphibot_glide().rows)
@@ -104,17 +65,11 @@ def test_a_chain_glides_as_far_as_measured():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("law", "ratio"), [("faces", 0.63), ("cross_flow", 0.96)])
-def test_a_chain_that_swims(law, ratio):
-    chain = measured_cases.body("ChainHead", measured_cases._pool(law), "ChainModule", 6)
+def test_a_chain_that_swims():
+    chain = measured_cases.body("ChainHead", measured_cases._pool("cross_flow"), "ChainModule", 6)
     [speed], error = measured_cases.swim(chain, [data.AMPHIBOT_SWIM], settle=3.0)
-    assert speed / data.AMPHIBOT_SWIM.speed == pytest.approx(ratio, abs=0.01)
+    assert speed / data.AMPHIBOT_SWIM.speed == pytest.approx(0.96, abs=0.01)
     assert error < 0.02  # the joints do what is prescribed
-
-
-def test_bias_and_scatter_of_ratios():
-    rows = [measured_cases.Row("", "", 1.0, x, "") for x in (0.5, 2.0)]
-    assert measured_cases.log_scatter(rows) == pytest.approx((1.0, np.log(4) / np.sqrt(2)))
 
 
 def test_a_flapping_foil_thrusts_too_much_unless_its_lift_lags():
@@ -140,42 +95,6 @@ def test_an_oscillating_plate_drags_several_times_too_little_unless_it_remembers
         assert min(abs(found[x] - 1) for x in (name, f"{name}, bilge keels")) < 0.1
 
 
-@pytest.fixture(scope="module")
-def vehicle():
-    return measured_cases.rov()
-
-
-def test_a_vehicles_outer_box_says_its_drag_and_added_mass_within_a_factor_of_four(vehicle):
-    for row in vehicle.rows:
-        if row.unit == "N":
-            assert 0.25 < row.ratio < 0.65
-        else:
-            assert 2.3 < row.ratio < 4.0
-
-
-def test_pictures_and_the_table(steady, polars, vehicle):
-    swung = measured_cases.Found(
-        [], {law: (np.array([3.0, 120.0]), np.ones(2)) for law in ("faces", "cross_flow")}
-    )
-    line = np.array([0.5, 1.0]), np.ones(2)
-    glide = measured_cases.Found([], {"way": line, "rotation": line})
-    coins = [
-        measured_cases.Row("coins", "a coin", 1.0, 1.0, u) for u in ("m/s", "cm") for _ in range(4)
-    ]
-    section = measured_cases.Found([], {"heave": line, "roll": line})
-    for figure in (
-        measured.draw_swimmers(glide, measured_cases.Found([])),
-        measured.draw_drag(steady, swung, swung),
-        measured.draw_polars(polars),
-        measured.draw_coins(measured_cases.Found(coins)),
-        measured.draw_rov(vehicle),
-        measured.draw_section(section),
-    ):
-        assert len(figure.axes) == 2
-    row = measured_cases.Row("case", "quantity", 2.0, 1.0, "m")
-    assert measured.table([row])[1] == ("case", "quantity", "2", "1", "0.50", "m")
-
-
 @pytest.mark.slow
 def test_a_ships_section_bobs_too_slowly_and_rolls_too_far():
     """Half out, a box carries too much water, and makes no waves that would damp it."""
@@ -188,14 +107,3 @@ def test_a_ships_section_bobs_too_slowly_and_rolls_too_far():
     # In long waves it goes with them: at ξ = .05 the wave is 60 breadths long.
     heave, _ = measured_cases.section_in_waves(0.05)
     assert heave == pytest.approx(1e3 * data.WAVE_AMPLITUDE, rel=0.1)
-
-
-@pytest.mark.long
-def test_the_command(tmp_path, capsys):
-    assert measured.main(["--quick", "--out", str(tmp_path)]) == 0
-    assert "ours / measured" in capsys.readouterr().out
-    names = {path.name for path in tmp_path.iterdir()}
-    assert names == {
-        "measured.csv", "measured_coins.png", "measured_drag.png", "measured_plates.png",
-        "measured_rov.png", "measured_swimmers.png",
-    }  # fmt: skip

@@ -5,8 +5,6 @@ imports exists, every command is one of ours, and its configurations, robots and
 accepted. Slow: the README's programs run, one after the other, as somebody who types them would.
 """
 
-from __future__ import annotations
-
 import ast
 import builtins
 import importlib
@@ -72,16 +70,6 @@ def test_no_program_uses_a_name_that_nothing_gave_it(page):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_what_programs_import_exists(page):
-    for text in programs(page):
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mjx_revolve"):
-                module = importlib.import_module(node.module)
-                for name in node.names:
-                    assert hasattr(module, name.name), f"{node.module}.{name.name}"
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_command_is_ours_and_its_settings_are_taken(page):
     configs = list_shipped("configs")
     for module, words in commands(page):
@@ -91,11 +79,6 @@ def test_every_command_is_ours_and_its_settings_are_taken(page):
             sets = [after for word, after in pairwise(words) if word == "--set"]
             first = [re.sub(r"^([^=]+=[^,\[{]*),.*", r"\1", s) for s in sets]  # of a grid
             load_config(name, first)
-
-
-def test_the_readme_has_commands_and_programs():
-    readme = PAGES[0]
-    assert len(programs(readme)) > 6 and len([*commands(readme)]) > 12
 
 
 @pytest.mark.long

@@ -1,21 +1,13 @@
 """The comparison with revolve2: the same brains and robots, and what its script reads and says."""
 
-from __future__ import annotations
-
-import os
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
 from experiments import revolve2_comparison as comparison
-from experiments.common import write_results
 from mjx_revolve import build_robot, load_world, make_cpg
 from mjx_revolve.engine.plant import plant_of
-from mjx_revolve.inputs.errors import InputError
-
-PYTHON = os.environ.get("REVOLVE2_PYTHON", "")
 
 
 def test_the_robots_are_made_of_revolve2s_modules():
@@ -47,36 +39,3 @@ def test_the_matrix_is_that_of_our_cpg():
         x = expm(dt * matrix) @ x
         expected = reach * np.tanh(x[:n])
         np.testing.assert_allclose(np.ravel(targets), expected[plant.source[:n, 0]], atol=1e-4)
-
-
-def test_a_python_without_revolve2_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"--python .*: expected a Python; found No such file"):
-        comparison.run_revolve2(tmp_path / "python", {})
-
-
-def test_results_name_versions_seeds_and_machine(tmp_path):
-    path = write_results("study", {"speed": 2.5}, [1, 2], tmp_path)
-    assert path == tmp_path / "study.json"
-    text = path.read_text()
-    assert '"speed": 2.5' in text and '"jax": "' in text and '"cpu_count": ' in text
-
-
-@pytest.mark.skipif(not PYTHON, reason="REVOLVE2_PYTHON names no Python that has revolve2")
-def test_revolve2_simulates_the_same_robots():
-    bodies = comparison.load_bodies()
-    genes = comparison.make_population(bodies, len(bodies), seed=0)
-    asked = {
-        "robots": comparison.as_json(bodies), "seconds": 1, "rate": comparison.RATE,
-        "timestep": comparison.TIMESTEP, "cores": 1,
-        "individuals": [
-            {"robot": k, "matrix": comparison.cpg_matrix(bodies[k], g).tolist()}
-            for k, g in enumerate(genes)
-        ],
-    }  # fmt: skip
-    found = comparison.run_revolve2(PYTHON, asked)
-    assert found["versions"]["revolve2-simulation"] == "1.2.4" and len(found["ways"]) == len(bodies)
-    bodies = comparison.load_bodies(found["robots"])
-    mass, place = comparison.difference(bodies, found["robots"])
-    assert mass < 1e-9 and place < 1e-5
-    core = bodies[0].modules[0].kind.mass
-    assert core > 0.47  # revolve2 loses its root's stated inertia; see `load_bodies`

@@ -2,8 +2,6 @@
 
 import csv
 import json
-import os
-import signal
 
 import numpy as np
 import pytest
@@ -11,15 +9,12 @@ import pytest
 from experiments import budgets, environments, studies
 from experiments.environments import ENVIRONMENTS
 from experiments.random_bodies import random_body
-from laboratory import ROOT, body
+from laboratory import ROOT
 from mjx_revolve.evolution.run_folder import RunFolder
 from mjx_revolve.evolution.sweeps import Plan
-from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.outcomes import Outcome, by_case
 from toys import CLOCK, make_toy_bodies
-
-# ------------------------------------------------------------------ runs
 
 TINY = [
     f"--set={setting}"
@@ -115,25 +110,6 @@ def test_a_study_runs_what_is_left_and_reports_it(tmp_path, started, monkeypatch
         assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_study_that_is_interrupted_says_how_it_goes_on(tmp_path, started, monkeypatch, capsys):
-    """Ctrl-C while the first picture is drawn: that run is finished, the next is not begun."""
-
-    def interrupt(start, champion):
-        os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(studies, "save_pictures", interrupt)
-    options = ("--only", "bed,shore", "--generations", "1")
-    assert study(tmp_path, *options) == 130
-    printed = capsys.readouterr().out
-    assert printed.startswith("[1/2] shore/seed_0: running ... ")
-    assert "\ngo on: python -m experiments.environments --out" in printed
-    assert not (tmp_path / "bed").exists()
-    monkeypatch.undo()
-
-
-# ------------------------------------------------------------------ what is compared
-
-
 def test_environments_are_what_they_are_called():
     plans = {
         name: Plan(name, 3, ROOT, studies.BASE, case.settings).config
@@ -170,28 +146,6 @@ def test_budgets_are_equal(settings):
             configs["random_search"].task,
             "neutral",
         )
-
-
-@pytest.mark.long
-def test_what_a_body_scores_at_rest_is_told():
-    """A spider hangs as it starts; a crooked body turns at first, and its core moves."""
-    case = ENVIRONMENTS["open_water"]
-    times = "task.settle=1.0", "task.duration=3.0"
-    settings = (*case.settings, *times, "task.start_attitude=level")
-    plan = Plan("open_water", 0, ROOT, studies.BASE, settings)
-    bodies = [body("spider"), random_body(1, 4, 3)]
-    given = [Outcome(plan, {"score": 1.0}, {}, {}, each) for each in bodies]
-    level, crooked = (o.champion["still_score"] for o in studies.score_still(given))
-    assert abs(level) < 0.01
-    assert crooked > 0.03
-
-    robot = budgets.make_cases()["spider"].settings
-    plan = Plan("spider", 0, ROOT, studies.BASE, (*robot, *settings))
-    (outcome,) = studies.score_still([given[0]._replace(plan=plan)])
-    assert outcome.champion == {"score": 1.0, "still_score": pytest.approx(level, abs=1e-4)}
-
-
-# ------------------------------------------------------------------ reports
 
 
 def outcomes(values):
@@ -236,32 +190,3 @@ def test_a_difference_is_said_only_where_the_tests_bear_it():
     assert lines == ["- No figure of champions tells two environments apart."]
     # Nor where all of them do not: one figure of many.
     assert environments.Compared("length", {}, 0.06, figures[0].comparison).differs == []
-
-
-@pytest.mark.slow
-def test_budgets_say_by_how_much_coevolution_is_better(tmp_path):
-    values = {"coevolution": [0.3, 0.3], "random_search": [0.1, 0.1], "fish": [0.1, 0.5]}
-    found = budgets.write_report(tmp_path, outcomes(values))
-    told = [(x["name"], x["difference"]["text"], round(x["p"], 2)) for x in found["differences"]]
-    assert told == [("random_search", "0.2", 0.67), ("fish", "0.0 ± 2.5", 1)]
-    assert found["fastest"] == {"score": 0.5, "name": "fish", "seed": 1}
-    assert [run["seeds"] for run in found["runs"]] == [2, 2, 2]
-    for name in ("budgets.png", "budgets_bodies.png"):
-        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize(
-    ("main", "arguments", "message"),
-    [
-        (environments.main, ["--only", "bed,moon"], "expected any of open_water, shore, bed, curr"),
-        (environments.main, ["--report"], "--report: expected runs that are finished; found none"),
-        (budgets.main, ["--set", "bodies.learning.population_size=0"], "expected a whole number"),
-    ],
-)
-def test_bad_options_end_with_one_line_and_code_2(main, arguments, message, tmp_path, capsys):
-    assert run_command(main, ["--out", str(tmp_path), *arguments]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith("error: ")
-    assert captured.err.count("\n") == 1
-    assert message in captured.err

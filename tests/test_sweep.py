@@ -6,21 +6,14 @@ Bits are compared within one process or on one machine with the same thread sett
 import csv
 import os
 import re
-import shutil
 import signal
-import subprocess
-import sys
-import time
 
 import pytest
 
 import toys
-from laboratory import ROOT, XLA_FLAGS
 from mjx_revolve import evolve, report, sweep
 from mjx_revolve.evolution.run_folder import RunFolder
-from mjx_revolve.evolution.sweeps import Sweep, read_sweep, write_sweep
 from mjx_revolve.inputs.commands import run_command
-from mjx_revolve.view.report.sweep import case_words
 from mjx_revolve.view.statistics import interval
 from toys import DroppedError, contents, dropping, make_toy
 
@@ -111,22 +104,6 @@ def test_a_sweep_is_a_grid_of_ordinary_runs_with_one_report(folder, no_pictures,
     assert run_command(report.main, ["out", "alone"]) == 2
 
 
-def test_seeds_may_begin_later(tmp_path):
-    sweep = Sweep("lake_swim", 2, first_seed=7)
-    write_sweep(tmp_path, sweep)
-    assert read_sweep(tmp_path) == sweep
-    assert [plan.seed for plan in sweep.plans(tmp_path)] == [7, 8]
-
-
-def test_cases_have_names_to_read():
-    grid = Sweep("a.yaml", 2, ("bodies.modules=[ActiveHinge],[FixedBrick,ActiveHinge]",
-                               "morphology=m/spider.yaml,gecko"))  # fmt: skip
-    assert [case_words(grid, case) for case in grid.cases] == [
-        "modules ActiveHinge; spider", "modules ActiveHinge; gecko",
-        "modules FixedBrick, ActiveHinge; spider", "modules FixedBrick, ActiveHinge; gecko",
-    ]  # fmt: skip
-
-
 @pytest.mark.slow
 def test_wherever_a_sweep_is_dropped_it_ends_in_the_same_bits(folder, no_pictures, capsys):
     assert run_sweep(*GRID, "--out", "whole") == 0
@@ -138,44 +115,6 @@ def test_wherever_a_sweep_is_dropped_it_ends_in_the_same_bits(folder, no_picture
     assert run_sweep(*GRID) == 0
     assert "finished before" in capsys.readouterr().out
     for name in RUNS:
-        assert contents(folder / "out" / name) == contents(folder / "whole" / name)
-
-
-_SLOW = """
-import sys
-sys.path.insert(0, {tests!r})
-import toys
-from mjx_revolve import sweep
-from mjx_revolve.inputs.commands import run_command
-
-if __name__ == "__main__":
-    sys.exit(run_command(lambda argv: sweep.main(argv, toys.make_slow)))
-"""
-
-
-@pytest.mark.long
-def test_a_killed_process_with_workers_goes_on(folder, no_pictures):
-    """Real processes: kill -9 in the second run; here, without workers, to the end."""
-    options = ("toy.yaml", "--seeds", "2", "--set", "evolution.generations=12", "--out")
-    (folder / "slow.py").write_text(_SLOW.format(tests=str(ROOT / "tests")))
-    metrics = folder / "out" / "toy" / "seed_1" / "metrics.csv"
-    words = [sys.executable, "slow.py", *options, "out", "--workers", "2"]
-    environment = os.environ | XLA_FLAGS | {"PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=environment) as process:
-        deadline = time.monotonic() + 120
-        while not metrics.exists() or len(metrics.read_bytes().splitlines()) < 6:
-            assert process.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-        process.kill()
-        assert process.stdout.read().endswith("[2/2] toy/seed_1: running ... ")
-    assert 5 <= len(RunFolder(metrics.parent).load_metrics()["generation"]) < 12
-
-    for out in ("out", "whole"):
-        assert run_sweep(*options, out) == 0
-    log = metrics.parent.with_name("seed_1.log").read_text()
-    assert log.count("resuming toy/seed_1 after generation") == 1
-    for name in ("toy/seed_0", "toy/seed_1"):
         assert contents(folder / "out" / name) == contents(folder / "whole" / name)
 
 
@@ -203,41 +142,6 @@ def test_ctrl_c_stops_after_the_generation_under_way(folder, capsys):
     assert (page.count("not finished</td>"), page.count("not begun</td>")) == (1, 2)
 
 
-@pytest.mark.slow
-def test_a_run_killed_before_its_first_checkpoint_begins_anew(folder, no_pictures, capsys):
-    one = ("toy.yaml", "--seeds", "1", "--out", "out")
-    assert run_sweep(*one) == 0
-    run = folder / "out" / "toy" / "seed_0"
-    whole = contents(run)
-
-    for path in (*run.glob("checkpoints/*"), *run.glob("champion/*")):
-        path.unlink()
-    (run / ".4711-run.json").write_text("half")
-    RunFolder(run).update_info(finished=None)
-    assert run_sweep(*one) == 0  # before its first checkpoint
-    assert contents(run) == whole
-    for there in ({".lock", "inputs"}, {".lock", "inputs", "run.json"}):  # while it was made
-        for path in run.iterdir():
-            if path.name not in there:
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
-        (run / ".4711-config.yaml").write_text("half")
-        assert run_sweep(*one) == 0
-        assert contents(run) == whole
-
-    # Nothing of the user's is removed.
-    (run / "thesis.txt").write_text("years of work")
-    for path in run.glob("checkpoints/*"):
-        path.unlink()
-    RunFolder(run).update_info(finished=None)
-    assert run_sweep(*one) == 0
-    assert (run / "thesis.txt").read_text() == "years of work"
-    (run / "run.json").unlink()
-    capsys.readouterr()
-    assert run_sweep(*one) == 2
-    assert "expected a run folder; found no run.json in it" in capsys.readouterr().err
-    assert (run / "thesis.txt").read_text() == "years of work"
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -245,21 +149,16 @@ def test_a_run_killed_before_its_first_checkpoint_begins_anew(folder, no_picture
             ["--set", "task.duration=5,-6"],
             "duration=-6: --set task.duration: expected a number >",
         ),
-        (["--set", "evolution.strategy=SNES,Magic"], "=Magic: --set evolution.strategy: expected"),
         (
             ["--set", "evolution.population_size=8,16", "--set", "task.settle=1,11"],
             "population_size=8+settle=11: --set task.settle: expected a time below task.duration",
         ),
-        (["--set", "evolution.seed=1,2"], "--set evolution.seed: expected --seeds N instead"),
         (["--workers", "2", "--cluster", "x"], "--cluster: expected no --workers beside it"),
-        (["--cluster", "nobody.json"], "nobody.json"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line_before_anything_is_written(
     arguments, message, folder, capsys
 ):
-    if "--cluster" in arguments[:1]:
-        pytest.importorskip("distributed")
     (folder / "out").mkdir()
     assert run_sweep("toy.yaml", "--out", "out", *arguments) == 2
     captured = capsys.readouterr()
@@ -267,63 +166,3 @@ def test_what_is_wrong_is_said_in_one_line_before_anything_is_written(
     assert captured.err.count("\n") == 1
     assert message in captured.err.replace(f"{folder}/", "")
     assert not [*folder.glob("out/*/*/run.json")]
-
-
-def test_a_folder_of_something_else_is_refused(folder, no_pictures, capsys):
-    (folder / "out").mkdir()
-    (folder / "out" / "thesis.txt").write_text("years of work")
-    assert run_sweep(*GRID) == 2
-    assert "expected a new or empty folder, or that of a sweep" in capsys.readouterr().err
-    one = ("toy.yaml", "--seeds", "1", "--out", "sweep")
-    assert run_sweep(*one) == 0
-    capsys.readouterr()
-    # Another sweep into the same folder, fewer generations, and a page of somebody else's.
-    assert run_sweep(*one, "--set", "task.duration=9") == 2
-    assert "task.duration: expected 10.0 as in the run; found 9.0" in capsys.readouterr().err
-    assert run_sweep(*one, "--set", "evolution.generations=4") == 2
-    assert "expected a run of 4 generations at most; found 5" in capsys.readouterr().err
-    (folder / "sweep" / "report.html").write_text("<p>my homepage")
-    assert run_sweep(*one) == 2
-    assert "expected no file or an earlier report" in capsys.readouterr().err
-    assert (folder / "sweep" / "report.html").read_text() == "<p>my homepage"
-
-
-@pytest.mark.slow
-def test_more_generations_go_on_where_each_run_ended(folder, no_pictures):
-    one = (*GRID, "--seeds", "1")
-    assert run_sweep(*one) == 0
-    assert run_sweep(*one, "--set", "evolution.generations=9") == 0
-    assert run_sweep(*one, "--set", "evolution.generations=9", "--out", "once") == 0
-    for name in RUNS[::2]:
-        assert contents(folder / "out" / name) == contents(folder / "once" / name)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("[]", "sweep.yaml: expected a mapping with config, seeds; found []"),
-        ("{config: a, seeds: 1, settings: ['a=[1']}", "sweep.yaml: --set a: expected a YAML value"),
-        ("{config: a, seeds: 1, settings: []}", "out: expected runs that are finished; found none"),
-    ],
-)
-def test_what_is_no_sweep_has_no_report(text, message, folder, capsys):
-    (folder / "out").mkdir()
-    (folder / "out" / "sweep.yaml").write_text(text)
-    assert run_command(report.main, ["out"]) == 2
-    captured = capsys.readouterr()
-    assert message in captured.err
-    assert captured.err.count("\n") == 1
-
-
-@pytest.mark.slow
-def test_a_damaged_run_is_named_and_the_others_are_reported(folder, no_pictures, capsys):
-    settings = ("--set", "controller.amplitude=0.5,1.0", "--set", "task.measures=[depth_m],[]")
-    assert run_sweep("toy.yaml", "--seeds", "1", "--out", "o<b>", *settings) == 0
-    damaged = next((folder / "o<b>").glob("*/seed_0/run.json"))
-    damaged.write_text("[")
-    assert run_command(report.main, ["o<b>"]) == 0
-    assert "expected a whole run; found: " in capsys.readouterr().err
-    page = (folder / "o<b>" / "report.html").read_text()
-    assert "3 of 4</b>runs finished" in page
-    assert "damaged</td>" in page
-    assert "<b>/" not in page  # names are text

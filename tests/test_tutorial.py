@@ -11,8 +11,6 @@ They are run literally, in an empty folder. `.venv/bin/python` is there a script
 Python that runs the tests; and XLA compiles by its older emitters, which takes half of the time.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

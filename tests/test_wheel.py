@@ -1,7 +1,5 @@
 """The installed package: a wheel holds all that a checkout has, and works from any folder."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

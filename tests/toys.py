@@ -1,7 +1,5 @@
 """Fitnesses that cost nothing and that worker processes can import by name, and a config."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import json

@@ -1,7 +1,5 @@
 """The catalogue against the tabulated values; box geometry; users' own types; refusals."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +14,6 @@ from mjx_revolve.body.catalogue import (
     THESIS_MODULES,
     Box,
     Hinge,
-    LiftDrag,
     ModuleType,
     Mount,
     Part,
@@ -26,9 +23,6 @@ from mjx_revolve.body.catalogue import (
 )
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.water.law_names import drag_names
-
-# ------------------------------------------------------------------------- the catalogue
 
 # type, part, box [m], box volume [m³] as printed, mesh volume [m³], mass [kg]
 TABLE = [
@@ -63,22 +57,6 @@ def test_hinge_limits_are_those_of_the_servo():
     assert hinge.axis == (0.0, 1.0, 0.0)
 
 
-def test_thesis_swaps_the_hinge_masses_only():
-    ours, theirs = MODULES["ActiveHinge"], THESIS_MODULES["ActiveHinge"]
-    assert [p.mass for p in theirs.parts] == [p.mass for p in reversed(ours.parts)]
-    assert theirs.mass == pytest.approx(ours.mass)
-    assert theirs.volume == ours.volume
-    assert all(THESIS_MODULES[n] is MODULES[n] for n in MODULES if n != "ActiveHinge")
-
-
-@pytest.mark.parametrize("name, free", [("Core", 4), ("FixedBrick", 3), ("ActiveHinge", 1)])
-def test_slots_look_away_from_the_module(name, free):
-    kind = MODULES[name]
-    assert len(kind.slots) == free
-    for slot in kind.slots.values():
-        assert np.dot(slot.position, slot.direction) > 0
-
-
 @pytest.mark.parametrize("name, axis", [("Thruster", 0), ("LiftThruster", 2)])
 def test_thrusters_push_half_a_newton_through_their_length(name, axis):
     kind = MODULES[name]
@@ -111,9 +89,6 @@ def test_the_fin_is_a_plate_of_abs_with_lift():
     assert (p.cda * angle).mean() == pytest.approx((p.cla * angle * np.tan(angle)).mean(), rel=0.01)
 
 
-# ------------------------------------------------------------------- masses, volumes, centres
-
-
 def test_ballast_moves_the_centres_of_mass_and_volume():
     part = Part(
         "p",
@@ -138,40 +113,11 @@ def test_ballast_moves_the_centres_of_mass_and_volume():
     assert (kind.mass, kind.volume) == pytest.approx((0.4, 4e-4))
 
 
-def test_what_weighs_or_displaces_nothing_has_its_centres_in_the_middle():
-    part = Part("p", (Box((1, 1, 1)),), mass=0.0, volume=0.0)
-    assert part.center_of_mass == part.displaced_center == (0.0, 0.0, 0.0)
-
-
-def test_a_part_fuller_than_its_box_has_no_room_for_water():
-    assert MODULES["TouchSensor"].parts[0].free_volume == 0.0
-
-
-# ------------------------------------------------------------------------- box geometry
-
-
-def test_faces_of_a_single_box_are_its_faces():
-    part = Part("p", (Box((2.0, 3.0, 5.0)),), 1.0, 30.0)
-    assert part.face_areas == pytest.approx([15.0, 10.0, 6.0])
-    low, high = part.bounds
-    assert low == pytest.approx([-1.0, -1.5, -2.5])
-    assert high == pytest.approx([1.0, 1.5, 2.5])
-
-
 def test_faces_count_shared_silhouettes_once():
     # Two unit cubes: the second half a unit to the right and 2 up.
     part = Part("p", (Box((1, 1, 1)), Box((1, 1, 1), (0.5, 0.0, 2.0))), 1.0, 1.0)
     assert part.face_areas == pytest.approx([2.0, 2.0, 1.5])
     assert part.box_volume == pytest.approx(2.0)
-
-
-def test_faces_of_the_servo_with_its_plate():
-    servo = MODULES["ActiveHinge"].parts[1]
-    x = 0.034 * 0.034  # the plate hides the box
-    y = 0.0245 * 0.015 + 0.001 * (0.034 - 0.015)
-    z = 0.0245 * 0.02575 + 0.001 * (0.034 - 0.02575)
-    assert servo.face_areas == pytest.approx([x, y, z])
-    assert servo.bounds[1] == pytest.approx([0.01225, 0.018, 0.017])
 
 
 def test_union_of_many_random_boxes_agrees_with_sampling():
@@ -223,68 +169,25 @@ def test_edge_against_edge_needs_the_cross_products():
         assert hit.tolist() == [expected]
 
 
-# ------------------------------------------------------------------------- refusals in code
-
 PART = Part("p", (Box((1, 1, 1)),), 1.0, 1.0)
 HINGE = Hinge((0, 1, 0), (0, 0, 0), (-1, 1), 1.0, 1.0)
 LINE = Thruster(curve="interpolated", commands=(-1, 0, 1), thrusts=(-1, 0, 2))
-MOUNT = Mount((-0.5, 0, 0), (1, 0, 0))
 
 
 @pytest.mark.parametrize(
     "make, message",
     [
         (lambda: Box((1, 0, 1)), "box: size.1: expected a number > 0 [m]; found 0"),
-        (lambda: Box((1, 1, True)), "box: size.2: expected a number > 0 [m]; found True"),
         (lambda: replace(PART, name="a/b"), "_ or -, beginning with a letter; found 'a/b'"),
-        (
-            lambda: replace(PART, boxes=(Box((1, 1, 1), (1, 0, 0)),)),
-            "part 'p': boxes.0.position: expected [0, 0, 0]",
-        ),
         (
             lambda: replace(PART, buoyancy="some"),
             "part 'p': buoyancy: expected one of partial, mask, off; found 'some'",
         ),
-        (
-            lambda: replace(PART, drag="inertia_box"),
-            f"part 'p': drag: expected {drag_names(of_parts=True)}; found 'inertia_box'",
-        ),
-        (lambda: replace(PART, lift_drag={"clap": 1}), "part 'p': lift_drag.clap: expected one of"),
         (lambda: Thruster(axis=(0, 0, 0)), "thruster: axis: expected a direction, not zero"),
-        (
-            lambda: Thruster(range=(0.1, 1)),
-            "thruster: range: expected [lowest, highest] around the command 0 [-]; found [0.1, 1.0",
-        ),
-        (
-            lambda: Thruster(gain_backward=1),
-            "thruster: gain_backward: expected none with curve basic; found 1.0",
-        ),
-        (lambda: Thruster(thrusts=(0, 1)), "thruster: thrusts: expected none with curve basic; f"),
-        (
-            lambda: Thruster(curve="dead_band", dead_band=(0.1, 0.2)),
-            "thruster: dead_band: expected [at most 0, at least 0] [-]; found [0.1, 0.2]",
-        ),
-        (
-            lambda: replace(LINE, thrusts=(0, 1)),
-            "commands: expected as many as thrusts, two or more; found 3 and 2",
-        ),
-        (
-            lambda: replace(LINE, commands=(-1, 1, 1)),
-            "thruster: commands: expected numbers that rise from each to the next [-]; found",
-        ),
         (lambda: replace(HINGE, range=(0.5, 1)), "hinge: range: expected [lowest, highest] around"),
         (lambda: Slot((0, 0, 1), (0, 0, 1)), "slot: up: expected a vector perpendicular"),
         (lambda: ModuleType("M", (PART, PART)), "parts: expected parts, each name once"),
-        (
-            lambda: ModuleType("M", (PART,), MOUNT, {0: Slot((0, 0, 0), (1, 0, 0))}),
-            "module 'M': slots: expected numbers >= 1 (0 is where it is attached); found 0",
-        ),
         (lambda: ModuleType("M", (replace(PART, mass=0),)), "expected a core heavier than 0 kg"),
-        (lambda: ModuleType("M", (PART, replace(PART, name="q")), None, {}, HINGE), "mount: exp"),
-        (
-            lambda: ModuleType("M", (PART, replace(PART, name="q", mass=0)), MOUNT, {}, HINGE),
-            "parts: expected a moving part (the second or later) heavier than 0 kg",
-        ),
     ],
 )
 def test_wrong_values_are_refused(make, message):
@@ -293,8 +196,6 @@ def test_wrong_values_are_refused(make, message):
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
-
-# ------------------------------------------------------------------------- users' own types
 
 FIN = """
 modules:
@@ -357,32 +258,6 @@ def test_own_types_are_read(tmp_path):
     assert kinds["Hoop"] is ring
 
 
-def test_the_example_in_the_docstring_works(tmp_path):
-    lines = load_modules.__doc__.split("::\n\n")[1].split("\n\n    `-x`")[0]
-    kinds = load_modules(write(tmp_path, lines))
-    flipper = kinds["Paddle"]
-    assert flipper.name == "Flipper"
-    assert [part.mass for part in flipper.parts] == [0.002, 0.006]
-    assert (flipper.parts[1].buoyancy, flipper.parts[1].drag) == ("partial", "lift_drag")
-    # What it calls a default is one.
-    defaults = Part("blade", flipper.parts[1].boxes, 0.006, 4e-6, position=(0.04, 0, 0))
-    assert replace(flipper.parts[1], buoyancy=None, drag=None, added_mass=None) == defaults
-    (fin,), (jet,) = kinds["PectoralFin"].parts, kinds["Jet"].parts
-    assert fin.lift_drag == LiftDrag(
-        cla=2.0, cda=0.3, alpha_stall=0.5, forward=(0, 1, 0), upward=(0, 0, 1)
-    )
-    assert jet.thruster == Thruster(
-        curve="dead_band", gain=0.3, dead_band=(-0.05, 0.05), time_constant=0.05, torque_ratio=2e-3
-    )
-
-
-def test_switches_may_be_off_without_quotes(tmp_path):
-    text = "{size: [1, 1, 1], mass: 1, buoyancy: off, drag: off, added_mass: off}"
-    kinds = load_modules(write(tmp_path, f"modules: {{M: {{mount: null, parts: [{text}]}}}}"))
-    (part,) = kinds["M"].parts
-    assert (part.buoyancy, part.drag, part.added_mass) == ("off", "off", False)
-
-
 def test_own_types_make_a_robot(tmp_path):
     mine = MODULES | load_modules(write(tmp_path, FIN))
     robot = """
@@ -438,54 +313,18 @@ def _set(*keys_and_value):
     return change
 
 
-def _drop(*keys):
-    *keys, last = keys
-
-    def change(data):
-        for key in keys:
-            data = data[key]
-        del data[last]
-
-    return change
-
-
 @pytest.mark.parametrize(
     "text, message",
     [
         ("", "mine.yaml: expected a mapping with modules; found None"),
-        ("modules: {A: 3}", "modules.A: expected a mapping with parts, mount"),
-        (
-            _changed(_set("Fin", "wings", 2)),
-            "modules.Fin.wings: expected one of parts, mount, slots",
-        ),
-        (_changed(_drop("Fin", "mount")), "modules.Fin.mount: expected a face such as -x, a mapp"),
-        (
-            _changed(_set("Fin", "parts", 0, "mass", "2 g")),
-            "modules.Fin.parts.0.mass: expected a number >= 0 [kg]; found '2 g'",
-        ),
         (
             _changed(_set("Fin", "parts", 1, "size", [1, 1, 1])),
             "modules.Fin.parts.1: expected one of size and boxes; found both or neither",
         ),
-        (
-            _changed(_set("Fin", "parts", 1, {"boxes": [{"size": [1, 1, 1]}] * 101, "mass": 1})),
-            "modules.Fin.parts.1.boxes: expected a list of 1 to 100 boxes",
-        ),
-        (
-            _changed(_set("Fin", "parts", 1, "lift_drag", {"clap": 1})),
-            "modules.Fin.parts.1.lift_drag.clap: expected one of 14 keys; found an unknown",
-        ),
         (_changed(_set("Fin", "mount", "-z")), "Fin.mount: expected -x, +x, -y, +y or a mapping"),
-        (_changed(_set("Fin", "mount", None)), "modules.Fin.mount: expected one, since it has"),
-        (_changed(_set("Fin", "slots", 1, {})), "Fin.slots.1.position: expected three"),
-        (_changed(_set("Fin", "slots", 0, "+x")), "slots: expected numbers >= 1 (0 is where"),
         (
             _changed(_set("Fin", "aliases", ["Hoop"])),
             "modules.Ring: expected each name and alias once; found Hoop twice",
-        ),
-        (
-            "modules: {3: {mount: null, parts: [{size: [1, 1, 1], mass: 1}]}}",
-            "modules: expected letters, digits, _ or -, beginning with a letter; found 3",
         ),
     ],
 )

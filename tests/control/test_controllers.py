@@ -1,7 +1,5 @@
 """Controllers from genes to targets, and the servos that follow them."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import jax
@@ -16,13 +14,11 @@ from laboratory import (
     body,
     elbow_robot,
     march,
-    random_states,
     read,
     world,
 )
 from mjx_revolve.control.cpg import make_cpg
-from mjx_revolve.control.gait import UNITS, describe_gait
-from mjx_revolve.control.kinds import find_controller
+from mjx_revolve.control.gait import describe_gait
 from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.control.sine import make_sine
 from mjx_revolve.engine.plant import plant_of
@@ -68,9 +64,6 @@ MAKERS = {
 }
 
 
-# ------------------------------------------------------------------------- genes
-
-
 @pytest.mark.parametrize("name", ["spider", "gecko", "snake", "centipede", "core"])
 def test_the_number_of_genes_follows_from_the_body(name):
     robot = robot_of(name)
@@ -78,16 +71,6 @@ def test_the_number_of_genes_follows_from_the_body(name):
     assert make_cpg(robot).num_genes == n + pairs
     assert make_sine(robot).num_genes == 3 * n + 1
     assert make_sine(robot, harmonics=3).num_genes == 7 * n + 1
-
-
-def test_the_names_that_a_configuration_gives():
-    plant = plant_of(robot_of("spider"))
-    for kind, genes in (("cpg", 18), ("sine", 25), ("feedback", 8 * (1 + 7))):
-        assert find_controller(plant, ControllerConfig(type=kind)).num_genes == genes
-    assert find_controller(plant, ControllerConfig(type="sine", harmonics=2)).num_genes == 41
-
-
-# ------------------------------------------------------------------------- descriptions
 
 
 def described(robot, genes, **settings):
@@ -145,19 +128,6 @@ def test_two_coupled_oscillators_gait():
     assert found["mean_amplitude"] == pytest.approx(size, rel=1e-5)
 
 
-def test_what_does_not_swing_has_no_gait():
-    robot = robot_of("spider")
-    for kind, count in (("sine", 25), ("cpg", 18)):
-        found = described(robot, np.zeros(count), type=kind)
-        assert list(found) == list(UNITS) and not any(found.values())
-    assert described(robot, np.zeros(64), type="feedback") == {}
-    assert not any(described(robot_of("core"), np.zeros(1), type="sine").values())
-    assert not any(described(robot_of("core"), np.zeros(0), type="cpg").values())
-
-
-# ------------------------------------------------------------------------- targets
-
-
 @pytest.mark.parametrize("kind", MAKERS)
 @pytest.mark.parametrize("amplitude", [1.0, 0.4])
 def test_targets_stay_within_the_range(kind, amplitude):
@@ -172,29 +142,6 @@ def test_targets_stay_within_the_range(kind, amplitude):
     fastest = 3 * 2 * np.pi * 2.0 * widest + 2 * widest
     moved = np.diff(targets, axis=0, prepend=np.zeros((1, 8, 64)))
     assert np.abs(moved).max() < 0.005 * fastest * amplitude * np.pi / 4
-
-
-def test_cpg_keeps_its_norm():
-    """The system matrix is antisymmetric: Σ x² + y² is constant to what Runge-Kutta errs by."""
-    robot = robot_of("spider")
-    controller = make_cpg(robot)
-    _, (x, y) = play(robot, controller, drawn(controller, 16), 4000)
-    norm = (x**2 + y**2).sum(1)
-    assert norm == pytest.approx(8.0, rel=2e-3)
-    assert np.abs(x).max() > 1.2  # the coupling moves energy between hinges
-
-
-def test_an_uncoupled_cpg_is_a_sine():
-    """x = sin(w t) where the couplings are zero; w = 2π f_max sin(gene)."""
-    robot = robot_of("spider")
-    controller = make_cpg(robot, max_frequency=1.5)
-    genes = np.zeros((18, 1))
-    genes[:8, 0] = np.linspace(-1.2, 1.2, 8)
-    targets, _ = play(robot, controller, genes, 400)
-    time = 0.005 * np.arange(1, 401)
-    w = 2 * np.pi * 1.5 * np.sin(genes[:8, 0])
-    expected = np.pi / 4 * np.tanh(np.sin(w * time[:, None]))
-    assert targets[..., 0] == pytest.approx(expected, abs=1e-5)
 
 
 def test_a_coupled_pair_against_the_matrix_exponential():
@@ -225,38 +172,6 @@ def test_sine_is_a_sine():
     expected = np.pi / 4 * (0.5 * np.sin(0.3) + wave)
     assert targets[120:, 0, 0] == pytest.approx(expected[120:], abs=1e-9)
     assert not targets[:, 1:].any()
-
-
-# ------------------------------------------------------------------------- servos
-
-
-def strokes(robot, lanes=32):
-    """From any angle to any target, at full effort, in a second."""
-    draw = np.random.default_rng(0)
-    n = robot.num_hinges
-    qpos, qvel = at_rest(robot, lanes, -5.0)
-    qpos[7:] = draw.uniform(-0.75, 0.75, (n, lanes))
-    ctrl = draw.choice([-1.0, -0.3, 0.3, 1.0], (n, lanes))
-    return np.clip(ctrl, -np.pi / 4, np.pi / 4), *march(robot, 1.0, qpos, qvel, ctrl)
-
-
-@pytest.mark.slow
-def test_servos_keep_the_speed_limit(elbow):
-    """Under water, hinges stay below 5.236 rad/s, and get where they are told to go."""
-    targets, _, q, v, _ = strokes(elbow)
-    assert np.abs(v[:, 6:]).max() < 1.05 * SPEED
-    assert np.abs(v[:, 6:]).max() > 0.8 * SPEED
-    assert np.abs(q[-1, 7:] - targets).max() < 0.02
-
-
-def test_servos_keep_the_speed_limit_in_a_vacuum():
-    """Limbs without water are so light that recoil throws them past it, by less than a fifth."""
-    robot = read(
-        "body: {type: Core, children: {1: {type: ActiveHinge, children: {1: {type: FixedBrick}}}}}"
-    )
-    _, _, _, v, _ = strokes(build_robot(robot, world()))
-    assert np.abs(v[:, 6]).max() < 1.2 * SPEED
-    assert np.mean(np.abs(v[:, 6]) > 1.01 * SPEED) < 0.01
 
 
 def test_servos_keep_their_effort():
@@ -308,13 +223,3 @@ def test_a_hinge_that_carries_nothing_comes_to_rest():
     qvel[6] = 1e-3
     _, _, v, _ = march(robot, 2.0, qpos, qvel, np.array([[0.0, 0.1]]))
     assert np.abs(v[-20:, 6]).max() < 1e-2
-
-
-@pytest.mark.slow
-def test_a_hinge_that_carries_a_brick_comes_to_rest(elbow):
-    qpos, qvel = random_states(elbow, 8, speed=0.1)
-    qvel[6:] = 1.0
-    ctrl = np.random.default_rng(0).uniform(-0.7, 0.7, (2, 8))
-    _, q, v, _ = march(elbow, 2.0, qpos, qvel, ctrl)
-    assert np.abs(v[-1, 6:]).max() < 0.01
-    assert np.abs(q[-1, 7:] - ctrl).max() < 0.01

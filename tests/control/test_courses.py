@@ -1,7 +1,5 @@
 """Courses: a direction that turns at moments, and all the time."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """Revolve's neural networks from a robot's YAML: read, run by hand, evolved and saved."""
 
-from __future__ import annotations
-
 import re
 
 import jax
@@ -10,10 +8,10 @@ import numpy as np
 import pytest
 import yaml
 
-from laboratory import WILD, read, world
+from laboratory import read, world
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.control.kinds import find_controller
-from mjx_revolve.control.neurons import evolve_brain, make_neural_network, read_neural_network
+from mjx_revolve.control.neurons import evolve_brain, make_neural_network
 from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import build_robot
@@ -133,17 +131,6 @@ def test_what_has_evolved_is_saved_and_runs_the_same(robot, tmp_path):
     assert robot.morphology.brain["params"]["mix"]["bias"] == 0.1  # which stays as it is
 
 
-@pytest.mark.skipif(not WILD, reason="the robots found in the wild are not here")
-def test_robots_in_the_wild():
-    found = {}
-    for path in WILD:
-        body = load_morphology(path, allow_overlap=True)
-        if isinstance(body.brain, dict) and "neurons" in body.brain:
-            robot = build_robot(body, world())
-            found[path.stem] = make_neural_network(plant_of(robot), body, str(path)).num_genes
-    assert found == {"robot_5": 6}  # two oscillators, whose inputs do nothing
-
-
 def changed(pattern, text):
     return re.sub(pattern, text, ROBOT, count=1)
 
@@ -151,16 +138,13 @@ def changed(pattern, text):
 @pytest.mark.parametrize(
     ("pattern", "text", "message"),
     [
-        ("type: Sigmoid", "type: XOscillator", "brain.neurons.7.type: expected one of Input, "
+("type: Sigmoid", "type: XOscillator", "brain.neurons.7.type: expected one of Input, "
          "Simple, Sigmoid, Oscillator; found 'XOscillator'"),
-        ("dst: mix, weight: 0.2", "dst: nix, weight: 0.2", "brain.connections.0.dst: expected the "
+("dst: mix, weight: 0.2", "dst: nix, weight: 0.2", "brain.connections.0.dst: expected the "
          "id of a neuron that is no input; found 'nix'"),
-        ("period: 0.8", "period: 0", "brain.params.clock.period: expected a number > 0 [s]; "),
-        ("part_id: arm", "part_id: hand", "brain.neurons.mix.part_id: expected the id of a hinge "
-         "or a thruster; found 'hand'"),
-        ("part_id: pad", "part_id: hand", "brain.neurons.t1.part_id: expected a module with 1 "
-         "inputs (a core has 6, a touch sensor 2, others none); found 'hand' of type FixedBrick"),
-    ],
+("part_id: arm", "part_id: hand", "brain.neurons.mix.part_id: expected the id of a hinge "
+         "or a thruster; found 'hand'")
+],
 )  # fmt: skip
 def test_wrong_networks(pattern, text, message):
     robot = build_robot(read(changed(pattern, text)), world())
@@ -188,8 +172,3 @@ def test_what_a_file_may_have_for_a_brain(robot):
         assert message in str(caught.value)
     with pytest.raises(InputError, match=r"run.yaml: controller.type: expected another one, as"):
         find_controller(plant, settings, "run.yaml")
-
-
-def test_inputs_by_list_and_without_a_type():
-    brain = {"neurons": [{"id": 1, "layer": "input", "part_id": "core"}]}
-    assert read_neural_network(brain, "x").neurons[0].type == "Input"

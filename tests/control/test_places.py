@@ -1,13 +1,10 @@
 """What is felt at modules: MuJoCo's own sensors at sites, for one body, in a batch, and in MJX."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-import yaml
 
 from laboratory import (
     OAR,
@@ -23,7 +20,6 @@ from laboratory import (
     world,
 )
 from mjx_revolve.body.catalogue import MODULES, load_modules
-from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.body.sensors import Sensor, SensorRow
 from mjx_revolve.control.readings import EpisodeContext, init_memory, read_sensors
 from mjx_revolve.control.sensors import DEFAULT_SENSORS, make_observer, resolve_sensors
@@ -34,7 +30,6 @@ from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.config import OLDER, OLDER_TASK, make_config
-from mjx_revolve.episodes.fitness import fit_body, make_mixed_fitness
 from mjx_revolve.evolution.fingerprints import settings_hash
 from mjx_revolve.inputs import schema
 from mjx_revolve.inputs.errors import InputError
@@ -247,38 +242,6 @@ def test_in_a_batch_of_different_bodies_they_feel_the_same(robot, spiders):
         capacity.plant.site("at back_foot")
 
 
-@pytest.mark.slow
-def test_sensors_on_modules_reach_the_observation(robot, spiders):
-    before, after, ctrl, sensors = spiders
-    declared = [
-        Sensor(type="flow", at="back_foot", range=100),
-        Sensor(type="accelerometer", at="left_knee", range=100),
-        Sensor(type="angle", at="left_knee", range=100),
-        Sensor(type="depth", each="FixedBrick", range=100),
-    ]
-    plant = make_engine(robot).plant
-    observer = make_observer(declared, DT, plant)
-    assert observer.signals == ("at back_foot", "at left_knee", "forces", "each FixedBrick")
-    assert observer.robot_names == (
-        "back_foot flow x", "back_foot flow y", "back_foot flow z", "left_knee accelerometer x",
-        "left_knee accelerometer y", "left_knee accelerometer z", "left_knee angle",
-        "FixedBrick depth",
-    )  # fmt: skip
-    assert observer.joint_names == ("FixedBrick depth",)
-    sense, source = felt(lambda: make_engine(robot), before, after, ctrl)
-    _, told = observer.observe((), jnp.zeros(()), sense, source[:8])
-    robots = 100 * np.stack(told.robot)
-    assert pytest.approx(expected(sensors, "back_foot")["flow"], abs=1e-4) == robots[:3].T
-    assert pytest.approx(sensors["left_knee", "accelerometer"], abs=0.02) == robots[3:6].T
-    assert robots[6] == pytest.approx(sensors["left_knee", "jointpos"][:, 0], abs=1e-5)
-    assert not robots[7].any()  # there is no brick on the core's rigid body
-    row = int(np.flatnonzero(source[:8, 0] == 1)[0])
-    wanted = -expected(sensors, "back_foot")["height"]
-    assert 100 * np.asarray(told.joint[0])[row] == pytest.approx(wanted, abs=1e-4)
-
-
-# ------------------------------------------------------------------------- touch
-
 PADS = """
 id: padded
 body:
@@ -291,7 +254,6 @@ body:
     3: {id: other, type: FixedBrick}
 """
 GROUND = world(gravity=9.81, bed={"height": -1.0})
-MUD = world(**WATER | {"bed": {"height": -1.0}})
 STIFF = GROUND.bed.stiffness
 
 
@@ -368,42 +330,11 @@ def test_a_box_at_rest_presses_its_halves_as_in_mujoco():
     assert np.concatenate(cells) == pytest.approx(lever, rel=1e-3)
 
 
-@pytest.mark.slow
-def test_the_beds_force_on_a_body_counts_what_rides_on_it():
-    """In a batch, bodies of many parts fill several rows; alone, one."""
-    robot, other = build_robot(read(PADS), MUD), elbow_robot(MUD)
-    capacity = fit_capacity([robot, other], hinges=2, modules=8)
-    bodies = pack_bodies([robot, other, robot], capacity, np.float64)
-    qpos = np.zeros((7 + 2, 3))
-    qpos[3], qpos[2] = 1.0, (-0.99, -0.985, -0.987)
-
-    def many():
-        plant = jax.tree.map(jnp.asarray, bodies.plant)
-        return PopulationEngine(make_batched_trees(MUD, capacity, bodies, 3), plant)
-
-    assert bodies.count.max() > robot.num_hinges  # some row rides
-    found, source = touched(many, qpos, "contact_force")
-    alone, _ = touched(lambda: make_engine(robot), qpos[:8, [0, 2]], "contact_force")
-    for lane, own in ((0, 0), (2, 1)):
-        rows = np.flatnonzero(source[:, lane] == 0)
-        assert found[0, lane] == pytest.approx(alone[0, own], rel=1e-9)
-        assert found[1 + rows[0], lane] == pytest.approx(alone[1, own], rel=1e-9)
-    assert alone.min() > 1
-
-
-# ------------------------------------------------------------------------- files
-
-
 @pytest.mark.parametrize(
     ("sensor", "message"),
     [
         ({"type": "gyro", "at": "a", "each": "Core"}, "0.each: expected none, as there is `at`"),
         ({"type": "touch"}, "0.at: expected the id of a module, as touch sits on one; found"),
-        (
-            {"type": "angle", "each": "Core"},
-            "0.each: expected none, as angle is at each hinge; found",
-        ),
-        ({"type": "contact", "each": "Core"}, "0.each: expected none, as contact is of each rigid"),
     ],
 )
 def test_sensors_that_cannot_sit_there(sensor, message):
@@ -453,42 +384,6 @@ def test_types_of_modules_bring_their_sensors(tmp_path):
     (tmp_path / "modules.yaml").write_text(FISHY.replace("type: gyro", "type: angle"))
     with pytest.raises(InputError, match=r"sensors.1: expected a kind that may sit on modules"):
         load_modules(tmp_path / "modules.yaml")
-
-
-@pytest.mark.slow
-def test_bodies_that_differ_have_the_sensors_of_their_modules(tmp_path):
-    """One body, alone and beside another one: the same score, to rounding."""
-    (tmp_path / "modules.yaml").write_text(FISHY)
-    (tmp_path / "paddle.yaml").write_text(PADDLE)
-    config = {
-        "morphology": str(tmp_path / "paddle.yaml"),
-        "modules": str(tmp_path / "modules.yaml"),
-        "world": {"name": "lake", "current": [0.1, 0, 0]},
-        "controller": {"type": "mlp", "hidden": 2, "messages": 0, "sensors": [
-            {"type": "accelerometer", "each": "FixedBrick"}, "angle"]},
-        "task": {"type": "directed_swim", "duration": 0.5, "settle": 0.0, "trials": 1},
-    }  # fmt: skip
-    modules = MODULES | load_modules(tmp_path / "modules.yaml")
-    examples = [make_morphology(yaml.safe_load(text), modules) for text in (PADDLE, OAR)]
-    settings = make_config(config, source="run.yaml")
-    mixed = make_mixed_fitness(settings, examples)
-    single = fit_body(settings, examples[0])
-    assert single.num_genes == mixed.num_genes
-    assert "FixedBrick flow x>h1" in single.controller.gene_names
-    genes = np.random.default_rng(0).normal(size=(2, mixed.num_genes)).astype(np.float32)
-    key = jax.random.key(0)
-    together = mixed([mixed.build(own) for own in examples], genes, key)
-    alone = single(genes[:1], key)
-    # Single precision, and hinges that meet their stops; in double, what is felt is the same.
-    assert together[0] == pytest.approx(float(alone[0]), abs=2e-4)
-    # The senses matter: with their weights at 0, it swims otherwise.
-    deaf = genes[:1].copy()
-    deaf[:, [k for k, n in enumerate(single.controller.gene_names) if "FixedBrick" in n]] = 0
-    assert abs(float(single(deaf, key)[0]) - float(alone[0])) > 2e-3
-    # A module's id is one body's alone.
-    named = config | {"controller": {"type": "mlp", "sensors": [{"type": "flow", "at": "hand"}]}}
-    with pytest.raises(InputError, match="expected `each` a type of modules in place of `at`"):
-        make_mixed_fitness(make_config(named, source="run.yaml"), examples)
 
 
 PADDLE = """

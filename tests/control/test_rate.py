@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 
 from laboratory import elbow_robot, world
-from mjx_revolve.control.cpg import make_cpg
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.control.readings import SensorReadings
-from mjx_revolve.control.sine import make_sine
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.episodes.config import (
     OLDER_WORLD,
@@ -78,13 +76,6 @@ def test_a_ramp_leads_from_the_last_command_to_this_one(plant):
         assert found == pytest.approx(np.moveaxis(np.array(late), -1, 0), abs=1e-9)
 
 
-def test_a_sine_is_sampled_at_the_instants(plant):
-    """Those of the brain without a rate, at these times."""
-    instants = np.arange(int(20 * LENGTH)) / 20
-    held = commands(plant, instants, 0.05, type="sine")
-    assert held == pytest.approx(commands(plant, instants, make=make_sine), abs=1e-12)
-
-
 def test_robots_of_different_ages_are_each_commanded_from_their_birth(plant):
     """Lanes with times of their own, as in a colony, have what lanes with one time have."""
     times = np.arange(0, LENGTH, 0.0125)
@@ -111,13 +102,6 @@ def test_a_cpgs_frequency_depends_neither_on_the_rate_nor_on_the_step(plant):
             for number in (1, 77, 199):
                 x = (expm(matrix * number / 10) @ [0, 0, 1, 1])[:2]
                 assert found[number, :, lane] == pytest.approx(np.pi / 4 * np.tanh(x), abs=1e-8)
-
-
-def test_without_a_rate_a_controller_acts_at_every_step(plant):
-    times = np.arange(0, 1, 0.005)
-    found = commands(plant, times, type="cpg", rate=None)
-    assert found == pytest.approx(commands(plant, times, make=make_cpg), abs=0)
-    assert (np.diff(found, axis=0) != 0).all()
 
 
 def test_older_runs_have_no_rate_and_keep_their_fingerprint(tmp_path):

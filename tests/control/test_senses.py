@@ -1,7 +1,5 @@
 """What a robot feels: against MuJoCo's own sensors, for one body, for many, and in MJX."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import jax
@@ -23,8 +21,7 @@ from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.population import PopulationEngine
-from mjx_revolve.engine.state import RootState
-from mjx_revolve.water.flow import Water, water_of
+from mjx_revolve.water.flow import water_of
 
 LANES = 3
 TANK = world(**WATER | {"current": (0.3, 0.0, 0.0), "bed": {"height": -9.0}})
@@ -232,24 +229,3 @@ def test_touch_is_the_beds_force_on_each_body(robot):
         bed, _ = jax.jit(push, compiler_options=QUICK)(jnp.asarray(qpos), jnp.asarray(qvel))
     # Nothing moves, so that no force has friction: all of them point up.
     assert found.touch.sum(0) == pytest.approx(np.asarray(bed[2]), rel=1e-9)
-
-
-@pytest.mark.slow
-def test_the_waters_surface_is_what_heights_are_measured_from(robot, states):
-    lifted = Water(1.5, TANK.current)
-    found, _ = senses(TANK, lambda: make_engine(robot), *states, water=lifted)
-    assert found.height == pytest.approx(states[0][2] - 1.5)
-
-
-def test_work_adds_up():
-    root = RootState(*(4 * (jnp.zeros(1),),) * 4)
-    memory = init_memory(("work",), *_toy())
-    for _ in range(3):
-        memory = update_memory(memory, root, root, jnp.zeros((0, 1)), jnp.array([2.0]), 0.1)
-    assert memory.work == pytest.approx(6.0)
-    assert memory.acceleration is None and memory.ctrl is None
-
-
-def _toy():
-    engine = make_engine(box_robot((0.1, 0.1, 0.1), 1.0, world()))
-    return engine, engine.init(jnp.zeros((7, 1)).at[3].set(1.0), jnp.zeros((6, 1)))

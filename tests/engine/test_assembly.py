@@ -3,8 +3,6 @@
 In float64: sums run in another order, so numbers agree to 1e-12 of the largest beside them.
 """
 
-from __future__ import annotations
-
 import pickle
 from functools import lru_cache
 
@@ -14,15 +12,13 @@ import numpy as np
 import pytest
 
 from experiments.random_bodies import random_body
-from laboratory import ROOT, body, read, world
+from laboratory import ROOT, read
 from mjx_revolve import build_robot, load_morphology, load_world, make_mixed_fitness
 from mjx_revolve.body.morphology import trim_neutral
 from mjx_revolve.engine.assembly import assemble
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.mujoco_model import compile_model
-from mjx_revolve.engine.plant import body_geometry
 from mjx_revolve.engine.step_constants import read_constants
-from mjx_revolve.inputs.errors import InputError
 
 # Fins, thrusters before and behind hinges, a point ballast, a plate that is its own body.
 ODD = """
@@ -132,20 +128,6 @@ def test_the_inertia_box_is_that_of_mujocos_principal_axes():
         )
 
 
-def test_the_ellipsoid_law_has_mujocos_numbers():
-    for robot in robots("ellipsoid"):
-        m, table = robot.mj_model, robot.fluid
-        names = [f"{a.name}/{p.name}" for a in robot.morphology.modules for p in a.kind.parts]
-        fluid = m.geom_fluid[[m.geom(name).id for name in names]]
-        density = robot.world.density
-        own = np.array(table.drag) == "ellipsoid"
-        ours = read_constants(robot.assembly).parts.drag["ellipsoid"]
-        # The largest and the sum do not depend on which axes describe the part.
-        for name, first in (("mass", 6), ("inertia", 9)):
-            found = np.sort(np.stack(getattr(ours, name), 1)[:-1], 1)
-            close(found[own], density * np.sort(fluid[own, first : first + 3], 1))
-
-
 def test_robots_side_by_side_have_the_bits_that_each_has_alone():
     """So that a score does not depend on whose body stands beside."""
     chosen = robots()
@@ -165,20 +147,6 @@ def test_robots_side_by_side_have_the_bits_that_each_has_alone():
         alone = jax.tree.leaves(pack_bodies([robot], capacity, np.float64))
         for one, many in zip(alone, jax.tree.leaves(packed), strict=True):
             assert np.array_equal(one[..., 0], many[..., k])
-
-
-def test_figures_are_those_of_the_body_at_rest():
-    for robot in robots():
-        figure, corners = (
-            body_geometry(robot),
-            robot.morphology.layout.core_corners().reshape(-1, 3),
-        )
-        assert figure.length == pytest.approx(robot.morphology.length)
-        assert figure.weight == pytest.approx(9.81 * robot.morphology.mass, rel=1e-3)
-        assert figure.lowest == pytest.approx(-corners[:, 2].min())
-        assert figure.radius == pytest.approx(np.linalg.norm(corners[:, :2], axis=1).max())
-        heavy = robot.morphology.mass / 2 > robot.world.density * robot.morphology.volume
-        assert figure.sinks is heavy
 
 
 def test_nothing_is_compiled_before_somebody_asks(monkeypatch):
@@ -202,9 +170,3 @@ def test_nothing_is_compiled_before_somebody_asks(monkeypatch):
     again = pickle.loads(pickle.dumps(robot))
     assert again.morphology == robot.morphology and again.world == robot.world
     assert np.array_equal(again.assembly.inertia, robot.assembly.inertia)
-
-
-def test_robots_of_two_worlds_do_not_stand_side_by_side():
-    one, other = build_robot(body("core"), world()), build_robot(body("core"), world(gravity=3.7))
-    with pytest.raises(InputError, match="robot 'core': expected the world of 'core'"):
-        pack_bodies([one, other], fit_capacity([one]))

@@ -1,7 +1,5 @@
 """Where a robot is and how long: its centre of mass by MuJoCo's, the stretched body by hand."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -10,12 +8,9 @@ import pytest
 
 from experiments.random_bodies import random_body
 from laboratory import body, random_states, read, world
-from mjx_revolve.engine.batch import fit_capacity, pack_bodies
-from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.kinematics import body_poses, mass_centers
 from mjx_revolve.engine.plant import body_geometry
-from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import build_robot
 
 WATER = {"gravity": 9.81, "buoyancy": "partial", "drag": "faces", "added_mass": True}
@@ -44,25 +39,6 @@ def test_the_centre_of_mass_is_mujocos(engine):
         np.testing.assert_allclose(found, expected, atol=1e-12)
         assert np.linalg.norm(found - qpos[:3].T, axis=1).min() > 0.01
         np.testing.assert_allclose(mass_centers(robot, qpos.T), expected, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_the_centres_of_mass_of_many_bodies_are_mujocos():
-    """Padding and overflow rows weigh nothing."""
-    with jax.enable_x64(True):
-        tank = world(**WATER)
-        robots = [build_robot(b, tank) for b in (random_body(4, 5, 9), body("snake"), body("core"))]
-        capacity = fit_capacity(robots, (), False, rows=14)
-        bodies = pack_bodies(robots, capacity, np.float64)
-        engine = PopulationEngine(make_batched_trees(tank, capacity, bodies, 3), bodies.plant)
-        states = [random_states(robot, 1, seed=k) for k, robot in enumerate(robots)]
-        qpos, qvel = (
-            np.stack([np.pad(s[i][:, 0], (0, size - len(s[i]))) for s in states], 1)
-            for i, size in ((0, 7 + capacity.hinges), (1, 6 + capacity.hinges))
-        )
-        found = engine.center_of_mass(engine.init(jnp.asarray(qpos), jnp.asarray(qvel)))
-        for robot, place, (own, _) in zip(robots, np.stack(found, 1), states, strict=True):
-            np.testing.assert_allclose(place, mujocos(robot, own[:, 0]), atol=1e-12)
 
 
 # A core with an arm on its front and one on its right: folded by a right angle at rest.

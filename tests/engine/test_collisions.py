@@ -22,7 +22,6 @@ from mjx_revolve.engine.interaction import (
 from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.spheres import pack_spheres, sphere_box
-from mjx_revolve.engine.state import State
 from mjx_revolve.episodes.rollout import Rollout, held
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.flow import water_of
@@ -119,19 +118,7 @@ def test_spheres_of_known_boxes():
     assert len(sphere_box((0.0, 0.0, 0.0))[0]) == 0
 
 
-def test_force_at_rest_is_the_springs():
-    """dt to 0, no speed: k d along the normal, and nothing apart."""
-    assert push_of(0.003, 0.0, 1.0, 1e-9)[0] == pytest.approx(2000 * 0.003, rel=1e-6)
-    assert push_of(-0.1, 0.0, 1.0, 1e-3)[0] == 0
-
-
-def test_friction_is_coulombs_against_the_slip():
-    """At 1 m/s the creep speed matters by 5e-7; dt to 0."""
-    normal, friction = push_of(0.003, 0.0, 1.0, 1e-9, slip=1.0)
-    assert np.allclose((*friction[:2], normal), (-0.4 * 6, 0, 6), rtol=1e-5)
-
-
-@pytest.mark.parametrize("slip", [0.01, 0.1, 1.0])
+@pytest.mark.parametrize("slip", [0.01, 1.0])
 def test_friction_stops_and_never_passes_coulombs_bound(slip):
     """Within a step of 10 ms, μ F takes .4 · 1.6 N · 10 ms / 100 g = 6 cm/s at most."""
     normal, friction = push_of(0.001, 0.0, 0.1, 0.01, slip=slip)
@@ -205,8 +192,8 @@ ASIDE = (np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0)  # x to z
 ACROSS = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # x to y
 
 
-@pytest.mark.parametrize("speed", [0.5, 1.0, 2.0])
-@pytest.mark.parametrize("dt", [0.005, 0.0125, 0.02])
+@pytest.mark.parametrize("speed", [0.5, 2.0])
+@pytest.mark.parametrize("dt", [0.005, 0.02])
 def test_light_rods_and_thin_plates_do_not_pass_through(dt, speed):
     """Broadside, rods crosswise: 20 g and 2 mm. Momentum to rounding, energy only lost."""
     run, kinds = rigid_pairs(dt)
@@ -267,11 +254,10 @@ def duel(dt: float):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dt", [0.002, 0.01])
 @pytest.mark.parametrize("speed", [0.1, 0.5])
-def test_boxes_meet_without_passing_and_keep_momentum(dt, speed):
+def test_boxes_meet_without_passing_and_keep_momentum(speed):
     """Off centre, so that friction and torque act: momentum kept to rounding, energy only lost."""
-    run, mass = duel(dt)
+    run, mass = duel(0.01)
     qpos = np.zeros((7, 2))
     qpos[0], qpos[1], qpos[3] = (-0.06, 0.06), (0.0, 0.03), 1
     qvel = np.zeros((6, 2))
@@ -295,11 +281,11 @@ def test_boxes_meet_without_passing_and_keep_momentum(dt, speed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dt", [0.005, 0.0125])
-def test_jointed_robots_meet_fast_and_lose_energy(dt):
+def test_jointed_robots_meet_fast_and_lose_energy():
     """Spiders, fish and snakes at 2 m/s: none through another, no energy made. Forces are equal
     and opposite; what is left of momentum is the step's own, of hinges that whip."""
-    space, names = world(timestep=dt), ("spider", "fish", "snake", "spider", "spider", "spider")
+    dt, names = 0.0125, ("spider", "fish", "snake", "spider", "spider", "spider")
+    space = world(timestep=dt)
     robots = [build_robot(body(name), space) for name in names]
     run = make_run(space, robots, 3, round(0.6 / dt), 1)
     qpos = np.zeros((7 + fit_capacity(robots).hinges, 6))
@@ -332,38 +318,6 @@ def test_jointed_robots_meet_fast_and_lose_energy(dt):
     change = np.linalg.norm(change - change[:, :1], axis=-1).max(1) / size
     assert change.max() < 0.02
     assert change[2] < 1e-3  # two spiders mirror each other, nearly
-
-
-@pytest.mark.slow
-def test_without_others_nothing_changes():
-    """A meeting of robots out of each other's reach leaves every bit as it is."""
-    space, _, capacity, tables, spheres = crowd_tables()
-    qpos, qvel = crowd(0)
-    qpos = qpos.at[0].add(3.0 * jnp.arange(8))
-
-    @partial(jax.jit, static_argnums=1, compiler_options=QUICK)
-    def run(packed, meet: bool):
-        tables, spheres = packed
-        rows = make_batched_trees(space, capacity, tables, 8)
-        meeting = (
-            make_interaction(rows, spheres, jnp.ones(8, bool), 1, ContactParameters())
-            if meet
-            else None
-        )
-        engine = PopulationEngine(rows, tables.plant, interaction=meeting)
-        state = engine.init(qpos, qvel)
-        assert isinstance(state, State)
-        pushes = (
-            (engine.interaction.detect(state, engine.interaction.init(state))[0].wrench,)
-            if meet
-            else ()
-        )
-        ctrl = jnp.zeros((tables.plant.num_rows, 8))
-        return engine.observe(engine.step(state, ctrl, water_of(space), *pushes)[0])
-
-    packed = tables, spheres
-    for a, b in zip(run(packed, True), run(packed, False), strict=True):
-        assert np.allclose(a, b, rtol=1e-13, atol=1e-13)
 
 
 def test_too_many_spheres_are_refused_by_name():

@@ -1,7 +1,5 @@
 """Energy balances: they close where motors, water, bed and contact are right, and only there."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from test_self_contact import fork

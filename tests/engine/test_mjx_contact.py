@@ -1,7 +1,5 @@
 """MJX's own contacts: MuJoCo's solver on top of our step, with the carried water in its matrix."""
 
-from __future__ import annotations
-
 import copy
 
 import mujoco
@@ -60,9 +58,6 @@ def clearance(robot, qpos):
     return np.array(found)
 
 
-# ------------------------------------------------------------------------- the setting
-
-
 def test_the_setting():
     """Penalty unless told otherwise; an override keeps the rest of the bed."""
     assert Bed().contact == "penalty"
@@ -73,7 +68,7 @@ def test_the_setting():
     )
 
 
-@pytest.mark.parametrize("found", ["MJX", "", None, True, 1, ["mjx"]])
+@pytest.mark.parametrize("found", ["MJX", None])
 def test_a_wrong_setting(found):
     with pytest.raises(InputError) as caught:
         load_world("lake", bed={"contact": found})
@@ -124,14 +119,6 @@ def test_modules_meet_the_bed_only():
     assert not plain.geom_contype.any()
     assert not plain.geom_conaffinity.any()
     assert (plain.opt.cone, plain.nnumeric) == (mujoco.mjtCone.mjCONE_PYRAMIDAL, 0)
-
-
-def test_parts_that_touch_nothing_stay_so():
-    robot = box_robot(SIZE, MASS, world(bed=FLAT), contact=False)
-    assert not robot.mj_model.geom("box/box").contype
-
-
-# ------------------------------------------------------------------------- resting and sliding
 
 
 @pytest.fixture(scope="module")
@@ -188,9 +175,6 @@ def test_without_water_it_is_mujocos_step():
             assert v[k, :, lane] == pytest.approx(data.qvel, abs=1e-4)
 
 
-# ------------------------------------------------------------------------- with all of the water
-
-
 @pytest.fixture(scope="module")
 def wet():
     """The box with drag and everything: thrown about, and set down in currents."""
@@ -224,39 +208,7 @@ def test_nothing_falls_through(wet):
         assert max(energy(a, b) for a, b in rows) < start
 
 
-@pytest.mark.slow
-def test_a_current_moves_it_where_friction_gives_way(wet):
-    """Drag at 0.2 m/s is a fifth of the grip, at 1 m/s five times as much."""
-    _, _, _, (_, q, v, _) = wet
-    assert np.abs(q[-1, :2, 5:7]).max() < 2e-3
-    assert np.abs(v[-1, :, 5:7]).max() < 1e-3
-    assert q[-1, 0, 7] > 0.5
-    assert 0.1 < v[-1, 0, 7] < 1.0
-
-
-@pytest.mark.slow
-def test_it_rests_where_the_penalty_has_it(wet):
-    _, _, _, (_, q, _, _) = wet
-    soft = block(drag="faces", bed=FLAT | {"contact": "penalty"})
-    qpos, qvel = at_rest(soft, 1, FLOOR + 0.002)
-    _, other, _, _ = march(soft, 1.0, qpos, qvel, every=10)
-    assert q[-1, :, 5] == pytest.approx(other[-1, :, 0], abs=5e-4)
-
-
-# ------------------------------------------------------------------------- slow ones
-
-
 @pytest.mark.long
-def test_without_friction_nothing_slows():
-    robot = block(bed=FLAT | {"friction": 0.0})
-    qpos, qvel = at_rest(robot, 1, FLOOR - sunk(robot, WEIGHT))
-    qvel[0] = 0.3
-    _, q, v, _ = march(robot, 0.5, qpos, qvel, engine="mjx")
-    assert v[:, 0, 0] == pytest.approx(0.3, abs=1e-6)
-    assert q[-1, 2, 0] == pytest.approx(FLOOR, abs=1e-3)
-
-
-@pytest.mark.slow
 def test_jointed_without_water_it_is_mujocos_step():
     """An elbow tips onto its corners; its hinges are soft springs, without what is ours alone.
 
@@ -306,7 +258,7 @@ def test_a_slope_is_slid_down_as_coulomb_has_it():
     assert v[-1, :3, 0] @ turn == pytest.approx([expected * time[-1], 0, 0], abs=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_core_lands_in_the_lake():
     """On the height field's triangles, that are within 4 mm of the lake's shape."""
     robot = build_robot(body("core"), load_world("lake", bed={"contact": "mjx"}))
@@ -328,18 +280,3 @@ def test_a_core_lands_in_the_lake():
     slid = np.linalg.norm(q[-1, :2] - q[75, :2], axis=0)
     assert np.all(slid[:3] < 1e-3)
     assert slid[3] > 0.02
-
-
-@pytest.mark.long
-def test_a_jointed_body_lies_still_in_float32():
-    """More contacts than it needs, upright and on its back; on top of the bed, and calm."""
-    robot = elbow_robot(load_world("empty_underwater", bed=FLAT))
-    qpos, qvel = at_rest(robot, 2, FLAT["height"] + 0.1)
-    qpos[3:7, 1] = 0, 1, 0, 0
-    ctrl = np.full((robot.mj_model.nu, 2), 0.3)
-    _, q, v, _ = march(robot, 2.0, qpos, qvel, ctrl, engine="mjx", every=4, x64=False)
-    for lane in range(2):
-        clear = clearance(robot, q[:, :, lane])
-        assert clear.min() > -5e-3
-        assert -1e-3 < clear[-1] < 1e-3
-        assert np.abs(v[-1, :3, lane]).max() < 0.02

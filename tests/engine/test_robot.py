@@ -1,7 +1,5 @@
 """The compiled robot: Revolve's geometry, masses, limits; tables that add up; MJCF that reloads."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 
@@ -9,12 +7,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import OURS, ROOT, WILD, body, box_robot, face_drag, read, world
-from mjx_revolve.body.catalogue import MODULES, load_modules
+from laboratory import OURS, WILD, body, face_drag, read, world
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.engine.batch import fit_capacity
 from mjx_revolve.engine.engines import make_engine
-from mjx_revolve.engine.robot import build_robot, check_timestep, export_mjcf
+from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.single_tree import make_single_tree
 from mjx_revolve.episodes.simulate import simulate
 from mjx_revolve.inputs.errors import InputError
@@ -41,9 +38,6 @@ def forward(robot):
     data = mujoco.MjData(robot.mj_model)
     mujoco.mj_forward(robot.mj_model, data)
     return data
-
-
-# ------------------------------------------------------------------------- the spider
 
 
 def test_spider_has_nine_bodies_fourteen_degrees_of_freedom(spider):
@@ -81,16 +75,6 @@ def test_spider_geometry_is_revolves(spider, side):
     assert plate @ out == pytest.approx(LEG["plate"], abs=1e-4)
     assert np.linalg.norm(plate - out * (plate @ out)) == pytest.approx(0.001, abs=1e-4)
     assert model.body(f"{side}_hip").parentid[0] == model.body("core").id
-
-
-def test_spider_masses_are_revolves(spider):
-    model = spider.mj_model
-    assert model.body("core").mass[0] == pytest.approx(0.0968)
-    for side in SIDES:
-        assert model.body(f"{side}_hip").mass[0] == pytest.approx(0.0209)
-        assert model.body(f"{side}_knee").mass[0] == pytest.approx(0.0192)
-    assert model.body_subtreemass[0] == pytest.approx(0.2572)
-    assert spider.fluid.volume.sum() == pytest.approx(2.41516e-4)
 
 
 def test_inertia_of_a_link_by_hand(spider):
@@ -135,9 +119,6 @@ def test_every_hinge_is_revolves(name):
     assert [model.actuator(k).name for k in range(model.nu)] == hinges
 
 
-# ------------------------------------------------------------------------- every robot
-
-
 @pytest.mark.parametrize("path", OURS + WILD, ids=lambda p: f"{p.parent.name}-{p.stem}")
 def test_every_morphology_builds(path):
     morphology = load_morphology(path, allow_overlap=True)
@@ -170,12 +151,6 @@ def test_every_morphology_builds(path):
     assert corners.max(0) == pytest.approx(high, abs=1e-9)
 
 
-def test_the_wild_robots_are_there_or_known_to_be_absent():
-    if not WILD:
-        pytest.skip(f"no third-party robots at {ROOT.parent / 'shared' / 'revolve_robots'}")
-    assert len(WILD) >= 5
-
-
 def test_fluid_table_of_the_catalogue():
     """Drag of a lone core: all faces meet the water; of a hinge's joined faces, none do."""
     robot = build_robot(body("core"), world(drag="faces", added_mass=True))
@@ -204,29 +179,6 @@ body:
     assert brick[1][1] < brick[1][0]
 
 
-# ------------------------------------------------------------------------- options and files
-
-
-@pytest.mark.parametrize("name", ["spider", "gecko"])
-def test_exported_mjcf_reloads_in_stock_mujoco(tmp_path, name):
-    robot = build_robot(body(name), load_world("empty_underwater"))
-    path = tmp_path / "robot.xml"
-    export_mjcf(robot, path)
-    model = mujoco.MjModel.from_xml_path(str(path))
-    ours, data = robot.mj_model, mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    assert model.nbody == ours.nbody
-    # XML keeps six to nine digits.
-    assert model.body_mass == pytest.approx(ours.body_mass, rel=1e-6)
-    assert model.body_inertia == pytest.approx(ours.body_inertia, rel=1e-5)
-    assert data.xpos == pytest.approx(forward(robot).xpos, abs=1e-6)
-    assert model.jnt_range == pytest.approx(ours.jnt_range, abs=1e-6)
-    assert model.actuator_gainprm == pytest.approx(ours.actuator_gainprm, rel=1e-5)
-    assert [model.body(i).name for i in range(model.nbody)] == [
-        ours.body(i).name for i in range(ours.nbody)
-    ]
-
-
 def test_the_bed_is_part_of_the_model():
     """A plane at the flat bed's height, a height field whose samples are the lake's heights."""
     flat = build_robot(body("core"), world(bed=Bed(kind="flat", height=-2.0))).mj_model
@@ -253,56 +205,6 @@ def test_world_options_reach_the_model():
     assert robot.qpos0.tolist() == [0, 0, 0, 1, 0, 0, 0]
     robot.qpos0[2] = 7.0  # a copy
     assert robot.qpos0[2] == 0.0
-
-
-def test_overrides_and_own_modules_reach_the_model(tmp_path):
-    path = tmp_path / "mine.yaml"
-    path.write_text("""
-modules:
-  Float:
-    mount: -x
-    parts:
-      - {name: foam, size: [0.04, 0.06, 0.02], mass: 0.01, center_of_volume: [0, 0, 0.002]}
-""")
-    text = """
-body:
-  type: Core
-  params: {mass: 0.12, electronics_volume: 3.0e-5}
-  children:
-    2: {id: foam, type: Float}
-"""
-    file = tmp_path / "boat.yaml"
-    file.write_text(text)
-    robot = build_robot(load_morphology(file, MODULES | load_modules(path)), world())
-    fluid = robot.fluid
-    assert robot.mj_model.nbody == 2
-    assert fluid.mass == pytest.approx([0.12, 0.01])
-    assert fluid.volume == pytest.approx([5.054e-5 + 3e-5, 0.04 * 0.06 * 0.02])
-    assert fluid.center_of_volume[1] == pytest.approx([0, 0, 0.002])
-    # Outward along +x: the foam's centre is half its length beyond the core's face.
-    assert fluid.position[1] == pytest.approx([0.0445 + 0.02, 0, 0], abs=1e-9)
-
-
-def test_a_body_that_mujoco_refuses_is_an_input_error():
-    with pytest.raises(InputError) as caught:
-        box_robot((0.1, 0.1, 0.1), 1e-20, world())
-    assert str(caught.value).startswith("box: expected a body that MuJoCo can simulate; found: ")
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("coefficient", [0.0, 1.05, 3.0])
-def test_the_longest_step_of_mujocos_laws_does_not_depend_on_ours(coefficient):
-    """Their C_d is 1: a plate of 100 cm² and 1 g bears 2 m / (ρ A v) = 0.2 ms at 1 m/s."""
-    tank = world(drag="ellipsoid", timestep=0.001)
-    plate = box_robot((0.1, 0.1, 0.002), 0.001, tank, drag_coefficient=coefficient)
-    with pytest.raises(
-        InputError, match=r"timestep: expected at most 0.0002 s, as drag: ellipsoid"
-    ):
-        check_timestep(plate)
-    check_timestep(box_robot((0.1, 0.1, 0.002), 0.02, tank, drag_coefficient=coefficient))
-
-
-# ------------------------------------------------------------------------- edited models
 
 
 @pytest.mark.parametrize("kind", ["spec", "model"])

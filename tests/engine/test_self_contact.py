@@ -1,7 +1,5 @@
 """Self-contact: depth, momentum, energy, mirrors, batches, MuJoCo's contacts, random bodies."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from functools import lru_cache
@@ -25,7 +23,6 @@ from mjx_revolve.engine.population import PopulationEngine, make_population_engi
 from mjx_revolve.engine.robot import build_robot, check_timestep
 from mjx_revolve.engine.self_overlap import self_overlap
 from mjx_revolve.engine.self_pairs import candidate_pairs
-from mjx_revolve.episodes.rollout import Rollout, StepInputs, open_loop
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.flow import water_of
 
@@ -163,37 +160,6 @@ def test_contact_keeps_momentum_and_takes_energy():
         assert taken < momentum(robot, qpos[:, k], alone[:, k])[1]
 
 
-@pytest.mark.slow
-def test_energy_never_rises_without_motors():
-    robot = limp(jaw(**EMPTY))
-    draw = np.random.default_rng(1)
-    qpos, qvel = at_rest(robot, 16)
-    qvel[6:] = 3 * np.sign(INWARDS) * draw.uniform(0.5, 1, (2, 16))
-    _, qpos, qvel, _ = march(robot, 0.5, qpos, qvel)
-    assert 0 < depths(robot, qpos).max() < 2e-3
-    energy = np.array(
-        [[momentum(robot, q[:, k], v[:, k])[1] for k in range(16)]
-         for q, v in zip(qpos, qvel, strict=True)]
-    )  # fmt: skip
-    # Semi-implicit Euler itself gives and takes some of a turning robot's energy.
-    assert np.diff(energy, axis=0).max() < 2e-3 * energy.max()
-    assert np.all(energy[-1] < 0.9 * energy[0])
-
-
-@pytest.mark.slow
-def test_mirror_images():
-    robot = jaw(timestep=0.01)
-    qpos, qvel = open_jaw(robot, 2)
-    qpos[7:, 1] = -qpos[:6:-1, 0]
-    ctrl = INWARDS + 0.3 * random_gaits(robot, 1, 150)
-    ctrl = np.concatenate([ctrl, -ctrl[:, ::-1]], -1)
-    _, qpos, _, _ = march(robot, 1.5, qpos, qvel, ctrl)
-    assert depths(robot, qpos).max(0).min() > 0
-    np.testing.assert_allclose(qpos[:, 7, 0], -qpos[:, 8, 1], atol=1e-9)
-    np.testing.assert_allclose(qpos[:, 0, 0], -qpos[:, 0, 1], atol=1e-9)
-    np.testing.assert_allclose(qpos[:, 1:3, 0], qpos[:, 1:3, 1], atol=1e-9)
-
-
 def feel(make, qpos, ctrl, wrench, steps):
     """After so many steps from rest: qpos, servo torques, and what contacts do to bodies, and to
     halves of modules, and to bodies under a wrench."""
@@ -293,29 +259,6 @@ def march_batch(robots, capacity, lanes, ctrl, steps):
         return np.asarray(run(bodies, jnp.asarray(ctrl)))
 
 
-@pytest.mark.long
-def test_a_body_alone_and_in_a_batch_agree():
-    world = water(timestep=0.01)
-    robots = [build_robot(x, world) for x in (fork(3, 1), fork(3, 0), body("spider"))]
-    assert [len(r.assembly.meeting_pairs) for r in robots] == [1, 4, 0]
-    capacity, steps = fit_capacity(robots), 80
-    ctrl = np.zeros((steps, 8, 6))
-    for k, robot in enumerate(robots):
-        own = random_gaits(robot, 2, steps)
-        ctrl[:, : robot.num_hinges, 2 * k : 2 * k + 2] = own + (INWARDS if k < 2 else 0)
-    found = march_batch(robots, capacity, 2, ctrl, steps)
-    for k, robot in enumerate(robots):
-        here = slice(2 * k, 2 * k + 2)
-        start = at_rest(robot, 2, -2.0)
-        alone = march(robot, 0.8, *start, ctrl[:, : robot.num_hinges, here])[1]
-        np.testing.assert_allclose(found[:, : alone.shape[1], here], alone, atol=1e-9)
-        assert (depths(robot, alone).max() > 0) == (k < 2)
-    # The same bits beside other neighbours.
-    order = [0, 1, 4, 5, 2, 3]
-    other = march_batch([robots[k] for k in (0, 2, 1)], capacity, 2, ctrl[..., order], steps)
-    np.testing.assert_array_equal(other[..., :2], found[..., :2])
-
-
 def test_contacts_are_mujocos():
     """Which pairs, when, and how deep: MuJoCo's contacts of the same model."""
     draw, seen = np.random.default_rng(0), 0
@@ -376,26 +319,6 @@ def test_pairs_that_can_never_meet_cost_nothing():
     ends = {snake.names[k] for k in snake.fluid.body[snake.meeting_pairs].ravel()}
     assert 0 < len(snake.meeting_pairs) < 12  # its ends meet when it curls up
     assert len(ends) <= 6
-
-
-@pytest.mark.long
-def test_gradients_through_a_contact_are_finite():
-    robot = jaw(timestep=0.02)
-    engine = make_population_engine(robot)
-    rollout = Rollout(engine, open_loop, robot.world, water_of(robot.world))
-
-    def end(ctrl):
-        start = rollout.init(engine.init(*map(jnp.asarray, at_rest(robot, 2, -2.0))))
-        keep = lambda now, *_: engine.observe(now.state)[0]  # noqa: E731
-        path = rollout.advance(start, keep, 30, 1, StepInputs(ctrl=ctrl), differentiable=True)[1]
-        return jnp.sum(path[-1, :3]), path
-
-    with jax.enable_x64(True):
-        ctrl = jnp.asarray(np.broadcast_to(INWARDS * [1.0, 0.9], (30, 2, 2)))
-        run = jax.jit(jax.grad(end, has_aux=True)).lower(ctrl).compile(QUICK)
-        slope, path = run(ctrl)
-    assert depths(robot, np.asarray(path)).max() > 0
-    assert bool(jnp.all(jnp.isfinite(slope))) and float(jnp.abs(slope).max()) > 0
 
 
 @pytest.mark.slow

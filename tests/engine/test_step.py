@@ -1,7 +1,5 @@
 """Whole steps with all laws at work: conserved, carried along, righted, differentiable."""
 
-from __future__ import annotations
-
 from functools import lru_cache, partial
 
 import jax
@@ -48,9 +46,6 @@ def quick_compiles():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
         yield
-
-
-# ------------------------------------------------------------------------- conservation
 
 
 def impulse(lagrangian, qpos, qvel):
@@ -109,9 +104,6 @@ def test_servos_give_no_more_energy_than_they_deliver():
         assert np.all(energy < 1.02 * (start + done))
 
 
-# ------------------------------------------------------------------------- water that moves
-
-
 def gusty(tank, seed, seconds):
     """The same gusts that `simulate` draws, and the water that they make."""
     steps = round(seconds / tank.timestep)
@@ -159,18 +151,6 @@ def test_gusts_move_a_heavy_body_less():
 
 
 @pytest.mark.slow
-def test_the_worlds_own_gusts_come_from_the_key():
-    """As `gust_path` draws them from the key that `simulate` is given."""
-    tank = world(added_mass=True, buoyancy="partial", gust={"std": 0.2, "time": 0.5})
-    robot = box_robot(CUBE, RHO * 1e-3, tank)
-    key = jax.random.key(4)
-    path = gust_path(tank.gust, jax.random.fold_in(key, 1), 100, tank.timestep, 1)[..., 0]
-    start = np.concatenate([path[0], np.zeros(3)])
-    found = simulate(robot, None, 0.5, qpos=robot.start_qpos(), qvel=start, key=key)
-    assert found.qvel[:, :3] == pytest.approx(np.asarray(path[1:]), abs=1e-5)
-
-
-@pytest.mark.slow
 def test_a_whole_rollout_does_not_know_how_fast_its_water_goes():
     """Galilei: in a uniform current, moving along with it, an arm strokes as in still water."""
     robot = arm_robot(world(**WATER))
@@ -211,22 +191,6 @@ def test_a_body_drifts_to_the_current(added_mass):
     assert np.linalg.norm(v[-1, :3, 0] - current) < 0.05
 
 
-def test_boxes_at_several_depths_see_several_currents():
-    """Linear shear: u₀ at the surface, half of it half way down, nothing below."""
-    shear = {"velocity": [0.4, -0.2, 0.0], "depth": 10.0}
-    robot = box_robot(CUBE, 1.0, world(drag="faces", added_mass=True, shear=shear))
-    qpos, qvel = at_rest(robot, 3)
-    qpos[2] = -1.0, -5.0, -12.0
-    time, q, v, _ = march(robot, 5.0, qpos, qvel, every=20)
-    inertia = 1.0 + RHO * robot.fluid.added_mass[0, 0]
-    drag = face_drag(robot).linear[0, 0]
-    for lane, share in enumerate((0.9, 0.5, 0.0)):
-        u = share * np.array([0.4, -0.2, 0.0])
-        expected = u - closing(u, drag, inertia, time[:, None])
-        assert v[:, :3, lane] == pytest.approx(expected, abs=0.005 * 0.4)
-    assert q[-1, 2] == pytest.approx(qpos[2], abs=1e-9)
-
-
 def test_a_floating_box_goes_with_a_long_wave():
     """Its height is the surface's where it is, its velocity the water's, its deck level with it."""
     amplitude, length = 0.2, 40.0
@@ -247,9 +211,6 @@ def test_a_floating_box_goes_with_a_long_wave():
     # Rotation about +y by θ turns the deck's normal to (θ, 0, 1); the surface's is (-η', 0, 1).
     assert pitch == pytest.approx(k * amplitude * np.sin(theta), abs=0.2 * k * amplitude)
     assert np.ptp(q[:, 2, 0]) > 1.9 * amplitude
-
-
-# ------------------------------------------------------------------------- parts
 
 
 def test_entrained_water_is_mass_without_weight():
@@ -323,14 +284,6 @@ def test_switches_of_single_modules(switch):
     check_switch(switch, -2.0, -0.5, ("population",))
 
 
-@pytest.mark.slow
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("switch", ["added_mass", "buoyancy"])
-def test_switches_of_single_modules_in_mjx(switch):
-    """Both engines share the water; one switch of its forces and one of the inertia will do."""
-    check_switch(switch, -2.0, -0.5, ("population", "mjx"))
-
-
 def test_what_a_world_switches_off_stays_off():
     """A module may not turn a law on that its world has turned off."""
     robot = winged("buoyancy: partial, drag: faces, added_mass: true", world(gravity=G))
@@ -370,9 +323,6 @@ def test_ballast_in_the_keel_rights_a_body():
         angle = 2 * np.arcsin(q[:, 4 + axis, 0])
         assert omega * 3.0 / (2 * np.pi) > 0.5
         assert angle == pytest.approx(0.02 * np.cos(omega * time), abs=0.02 * 0.04)
-
-
-# ------------------------------------------------------------------------- gradients
 
 
 def check_slope(robot, *cases, kinks=(), compiled=QUICK):
@@ -466,7 +416,7 @@ def test_gradient_in_waves_and_in_contact():
     check_slope(build_robot(body("core"), tank), afloat, sliding)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_gradient_through_thrusters():
     """In the commands, behind their lag; one of them stands still."""
     inputs = {"ctrl": np.array([0.5, -0.3, 0.0, 0.8]), "qvel": np.full(6, 0.05)}

@@ -1,11 +1,8 @@
 """Thrusters and fins in whole steps: steady speed, lag, torque, MuJoCo's actuators, the fish."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -43,9 +40,6 @@ def quick_compiles():
 def driven(tank, **thruster):
     """A neutral cube with a thruster in its centre."""
     return box_robot(CUBE, NEUTRAL, tank, thruster=Thruster(**thruster))
-
-
-# ------------------------------------------------------------------------- one thruster
 
 
 def test_speed_under_thrust():
@@ -94,12 +88,6 @@ def test_a_propeller_turns_its_robot_the_other_way(ratio):
     assert qacc[3:] == pytest.approx(-ratio * 0.5 * axis / inertia, rel=1e-9)
 
 
-def test_thrust_off_the_centre_turns_too():
-    robot = driven(world(), gain=0.5, position=(0.0, 0.03, 0.0))
-    qacc = accelerate(robot, *at_rest(robot, 1, -5.0), np.ones((1, 1)))[:, 0]
-    assert qacc[5] == pytest.approx(-0.5 * 0.03 / (NEUTRAL * 0.1**2 / 6), rel=1e-9)
-
-
 def test_out_of_the_water_there_is_nothing_to_push():
     """In the air it falls, and neither flies nor spins; half in it, it has half of its thrust."""
     robot, share = driven(world(**WATER), gain=0.5, torque_ratio=0.02), np.array([0.0, 0.5, 1.0])
@@ -110,9 +98,6 @@ def test_out_of_the_water_there_is_nothing_to_push():
     assert qacc[0] == pytest.approx(0.5 * share / inertia, abs=1e-12)
     assert qacc[2] == pytest.approx(-(1 - share) * NEUTRAL * G / inertia, abs=1e-9)
     assert qacc[3] == pytest.approx(-0.02 * 0.5 * share / (NEUTRAL * 0.1**2 / 6), rel=1e-6)
-
-
-# ------------------------------------------------------------------------- MuJoCo's actuators
 
 
 def linear(morphology):
@@ -156,9 +141,6 @@ def test_a_linear_thruster_is_mujocos_filtered_actuator():
         assert np.clip(ctrl[:, lane], -1, 1) * (1 - np.exp(-10)) == pytest.approx(data.act)
 
 
-# ------------------------------------------------------------------------- auv and fish
-
-
 @pytest.mark.slow
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["auv", "fin"])
@@ -196,34 +178,3 @@ def test_the_auv_surges_without_pitch_and_heaves_without_drift():
     assert np.abs(heave[:, :2]).max() < 1e-3
     # Yaw stays, as propellers of a pair turn against each other.
     assert np.abs(q[:, 6]).max() < 1e-3
-
-
-def tail_wave(t):
-    """A wave that runs down the tail, 1 Hz, growing towards the fin [rad]."""
-    phase = 2 * np.pi * t - np.arange(3)
-    return jnp.minimum(t, 1.0) * jnp.array([0.2, 0.4, 0.6]) * jnp.sin(phase)
-
-
-@pytest.mark.slow
-def test_the_fish_swims_ahead_and_halving_the_step_changes_little():
-    """By its tail alone, level and at its depth."""
-    ends = []
-    for dt in (0.005, 0.0025):
-        robot = build_robot(body("fish"), world(**WATER, timestep=dt))
-        found = simulate(robot, tail_wave, 6.0, qpos=robot.start_qpos(2.0))
-        assert np.all(np.isfinite(found.qpos))
-        ends.append(np.asarray(found.qpos[-1]))
-        assert found.qpos[-1, 1] > 0.07
-        up = 1 - 2 * (found.qpos[:, 4] ** 2 + found.qpos[:, 5] ** 2)
-        assert up.min() > 0.95
-        assert np.abs(found.qpos[:, 2] + 2.0).max() < 0.05
-    assert np.linalg.norm(ends[1][:3] - ends[0][:3]) < 0.02 * ends[0][1]
-
-
-@pytest.mark.slow
-def test_a_fish_that_does_not_move_stays_where_it_is():
-    """Neutral and trimmed: a centimetre and a degree in 5 s."""
-    robot = build_robot(body("fish"), world(**WATER))
-    found = simulate(robot, None, 5.0, qpos=robot.start_qpos(2.0))
-    assert np.abs(found.qpos[-1, :3] - np.array([0, 0, -2.0])).max() < 0.01
-    assert np.abs(found.qpos[-1, 4:7]).max() < 0.01

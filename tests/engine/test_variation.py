@@ -1,7 +1,5 @@
 """Factors on coefficients: the same as a world, a module or a servo that has them."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """Gymnasium's ids, Stable-Baselines3's interface and the pure environment: one environment."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -53,9 +51,6 @@ def vector(config, keys, actions):
     return [np.array(column) for column in zip(*found, strict=True)]
 
 
-# ------------------------------------------------------------------------------- Gymnasium's ids
-
-
 def test_every_shipped_task_of_one_robot_has_an_id():
     whole = {name: load_config(name) for name in list_shipped("configs") if name != "smoke"}
     single = [n for n, c in whole.items() if c.bodies is None and c.colony is None]
@@ -91,9 +86,6 @@ def test_gymnasium_finds_nothing_wrong_with_one(config):
     assert total == pytest.approx(info["score"], abs=1e-6)
     many = gymnasium.make_vec("mjx_revolve/FishSwim-v0", 2, config=config)
     assert many.reset(seed=0)[0].shape == (2, env.observation_space.shape[0])
-
-
-# ------------------------------------------------------------------------------- the pure one
 
 
 @pytest.mark.slow
@@ -132,9 +124,6 @@ def test_one_environment_is_a_row_of_the_batch_and_episodes_can_be_scanned(
     np.testing.assert_allclose(rewards, vector[1][1 : STEPS + 1, 1], atol=2e-5)
     assert done.tolist() == truncated.tolist() == [0.0] * (STEPS - 1) + [1.0]
     assert float(rewards.sum()) == pytest.approx(float(last.metrics["score"]), abs=1e-5)
-
-
-# ------------------------------------------------------------------------------- Stable-Baselines3
 
 
 @pytest.mark.slow

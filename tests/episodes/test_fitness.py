@@ -1,7 +1,5 @@
 """The fitness function: pure, batched, safe from one individual's failure. Known answers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import QUICK, SLOPE, read, swimmer
-from mjx_revolve import InputError, make_fitness, make_mixed_fitness
+from laboratory import swimmer
+from mjx_revolve import InputError, make_fitness
 from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.scoring import WORST
 from mjx_revolve.episodes.tasks import TASKS, Track, find_task, score_unit, shown_measure
@@ -65,30 +63,10 @@ def test_one_score_each_and_the_same_again(fitness, population, scores):
 
 
 @pytest.mark.slow
-def test_without_fused_steps_the_scores_are_the_same(settings, population, scores, monkeypatch):
-    """`MJX_REVOLVE_FUSE=0`: to rounding, as the compiler contracts other products."""
-    monkeypatch.setenv("MJX_REVOLVE_FUSE", "0")
-    plain = make_fitness(settings)
-    compiled = jax.jit(plain.evaluate).lower(population, KEY).as_text()
-    assert "small_call" not in compiled and "inlineable" not in compiled
-    np.testing.assert_allclose(plain(population, KEY), scores, rtol=1e-3, atol=1e-5)
-
-
-@pytest.mark.slow
 def test_an_individual_does_not_feel_the_population_around_it(fitness, population, scores):
     """70 individuals of 2 episodes are 3 chunks of 64 lanes, 40 are two, the last one padded."""
     few = np.asarray(fitness(population[:40], KEY))
     np.testing.assert_array_equal(few, scores[:40])
-
-
-@pytest.mark.slow
-def test_an_individual_adds_little_memory_however_long_it_lives(settings):
-    """XLA's own sum of what lives beside arguments and results; a track alone would be 800 B."""
-    long = make_fitness(settings, **{"task.duration": 5.0, "task.trials": 1})
-    count = 2**16
-    population = jax.ShapeDtypeStruct((count, long.num_genes), jnp.float32)
-    compiled = jax.jit(long.evaluate, compiler_options=QUICK).lower(population, KEY).compile()
-    assert compiled.memory_analysis().temp_size_in_bytes / count < 200
 
 
 @pytest.mark.slow
@@ -100,38 +78,7 @@ def test_a_blown_up_individual_scores_worst_and_spreads_nothing(fitness, populat
     np.testing.assert_array_equal(found[others], scores[others])
 
 
-@pytest.mark.slow
-def test_zero_genes_do_no_work(fitness, population):
-    score, measures = fitness.evaluate(jnp.zeros_like(population), KEY)
-    # The oar is heavier at one end and lighter at the other, so it turns a little, without work.
-    assert float(measures["energy_j"][0]) < 1e-3
-    assert float(measures["depth_error_m"][0]) < 1e-2  # it is trimmed
-    assert abs(float(score[0])) < 0.1
-
-
-@pytest.mark.slow
-def test_under_jit_and_vmap(fitness, population, scores):
-    # Another compilation: equal to rounding, which a second of stroking may amplify a little.
-    mapped = jax.vmap(lambda genes: fitness(genes, KEY))
-    both = jax.jit(mapped, compiler_options=QUICK)(population[:40].reshape(2, 20, -1))
-    np.testing.assert_allclose(both.reshape(-1), scores[:40], atol=2e-4)
-
-
 @pytest.mark.long
-def test_gradient_points_uphill(settings):
-    short = make_fitness(settings, **{"task.duration": 0.6, "task.trials": 1})
-    genes = 0.3 * jnp.ones((1, short.num_genes))
-    slope = jax.jit(jax.grad(lambda g: short(g, KEY)[0]), compiler_options=SLOPE)(genes)
-    assert np.all(np.isfinite(slope)) and np.any(np.asarray(slope) != 0)
-    step = 0.002 * slope / jnp.linalg.norm(slope)
-    up, down = float(short(genes + step, KEY)[0]), float(short(genes - step, KEY)[0])
-    found = (up - down) / (2 * 0.002)
-    # Central differences in float32 over 0.002: a few per cent. Over more, commands that jump 20
-    # times a second and are held bring servos to their effort and off it.
-    assert found == pytest.approx(float(jnp.linalg.norm(slope)), rel=0.1)
-
-
-@pytest.mark.slow
 def test_mjx_scores_the_same(settings, population, scores):
     slow = make_fitness(settings, engine="mjx")
     np.testing.assert_allclose(slow(population[:2], KEY), scores[:2], atol=2e-4)
@@ -207,7 +154,7 @@ def test_tasks_with_known_scores(task, given, score):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rate", [0.0, 0.05, 0.2, -0.6])
+@pytest.mark.parametrize("rate", [0.0, -0.6])
 def test_a_horizon_foretells_the_way_of_a_circle(rate):
     """At 1 m/s and so many rad/s: from 20 s the net way of 120 s, by the chord of the arc."""
     time = np.arange(21.0)
@@ -246,32 +193,6 @@ def test_a_horizon_foretells_when_depth_is_left():
     assert float(TASKS["speed"].score(track(time, z=0.002 * time), SETTINGS)[0]) == 2.0
 
 
-@pytest.mark.slow
-def test_in_a_void_nothing_gets_anywhere(tmp_path):
-    """What only shakes its core moves that, and its centre of mass not at all."""
-    own = swimmer(tmp_path, ROBOT, TASK | {"start_tilt": 0.0, "duration": 2.0})
-    void = {"name": "empty_underwater", "density": 0.0, "gravity": 0.0, "buoyancy": "off"}
-    void |= {"drag": "off", "added_mass": False}
-    moved = {}
-    for point in ("core", "center_of_mass"):
-        settings = own | {"trim": "none", "world": void}
-        fitness = make_fitness(settings, **{"task.point": point, "task.settle": 0.1})
-        genes = jnp.full((1, fitness.num_genes), 1.0)
-        moved[point] = float(fitness.evaluate(genes, KEY)[1]["path_length_m"][0])
-    # What is left is the first-order error of a step of 5 ms.
-    assert moved["core"] > 0.01 and moved["center_of_mass"] < moved["core"] / 20
-
-
-@pytest.mark.slow
-def test_the_length_is_the_tasks(settings, fitness, population, scores):
-    """A body's scores by its two lengths stand in their inverse ratio."""
-    assert fitness.settings.length == "stretched"
-    rest = make_fitness(settings, **{"task.length": "rest"})(population[:4], KEY)
-    sizes = fitness.geometry
-    np.testing.assert_allclose(rest * sizes.length, scores[:4] * sizes.stretched, rtol=1e-5)
-    assert sizes.stretched >= sizes.length
-
-
 def test_scores_in_metres_leave_the_body_length_out():
     given = track([0, 1, 2])
     swim = find_task(TaskConfig(type="directed_swim", unit="m"))
@@ -284,21 +205,3 @@ def test_scores_in_metres_leave_the_body_length_out():
         "my.yaml: task.unit: expected body_lengths, as the scores of search do not say that they "
         "are in body lengths; found m"
     )
-
-
-@pytest.mark.slow
-def test_single_chains_have_populations_of_their_own(settings, fitness, population):
-    """XLA:CPU aborts over the program for one body if all are chains of a few hinges."""
-    chain = """
-body:
-  type: Core
-  children:
-    1: {type: ActiveHinge, children: {1: {type: FixedBrick, children: {1: {type: ActiveHinge}}}}}
-"""
-    mixed = make_mixed_fitness(settings, [read(ROBOT), read(chain)])
-    robots = [mixed.build(read(text)) for text in (ROBOT, chain)]
-    genes = np.asarray(jax.random.normal(jax.random.key(1), (2, 2, mixed.num_genes)))
-    found = np.asarray(mixed(robots, genes, KEY))
-    alone = fitness(population.at[:2].set(mixed.own_genes(genes[0], robots[0])), KEY)
-    np.testing.assert_allclose(found[0], alone[:2], rtol=1e-3, atol=2e-4)
-    assert np.isfinite(found).all() and found[1, 0] != found[1, 1]

@@ -1,7 +1,5 @@
 """Measures of episodes: tracks made by hand, for one robot and for several with fewer hinges."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
@@ -56,9 +54,6 @@ def swing(frequency, lags=(0.0, 0.7, 1.4), sizes=(0.4, 0.4, 0.4), time=TIME):
     return np.stack(waves, 1)
 
 
-# ------------------------------------------------------------------ the table
-
-
 @pytest.mark.slow
 def test_every_measure_is_made_and_in_the_tables_order():
     given = still(
@@ -90,14 +85,6 @@ def test_speed_through_the_water_leaves_drift_out():
     drift = np.outer(np.sin(TIME), [0.2, 0, 0])
     found = read(track(drift, water_velocity=gust), "water_speed_m_s")
     assert found["water_speed_m_s"] < 1e-3
-
-
-def test_a_measure_that_is_asked_for_comes_alone():
-    found = read(still(angle=swing(1.0)), "gait_frequency_hz", "speed_m_s")
-    assert {*found} == {*ALWAYS, "gait_frequency_hz"}
-
-
-# ------------------------------------------------------------------ ways
 
 
 def test_there_and_back_again():
@@ -149,13 +136,6 @@ def test_a_core_that_leans(axis):
     assert found["turn_rate_rad_s"] == pytest.approx(0.0, abs=1e-5)
 
 
-def test_a_roll_is_no_turn():
-    """Twice round its own long axis, which lies level: its x axis points ahead and back again."""
-    half = 2 * np.pi * np.arange(90) / 89
-    quat = np.stack([np.cos(half), 0 * half, np.sin(half), 0 * half], 1)
-    assert read(still(quat=quat), "turn_rate_rad_s")["turn_rate_rad_s"] == pytest.approx(0.0)
-
-
 def test_a_jump():
     """In the air for 30 of 90 rows; on the bed it weighs 0.5 N, and lands on it with 5 N."""
     force = np.zeros((90, 3))
@@ -167,10 +147,7 @@ def test_a_jump():
     assert found["bed_force_n"] == pytest.approx((59 * 0.5 + 5) / 90)
 
 
-# ------------------------------------------------------------------ gaits
-
-
-@pytest.mark.parametrize("frequency", [0.5, 1.3, 2.0, 3.9])
+@pytest.mark.parametrize("frequency", [0.5, 3.9])
 def test_a_wave_along_the_joints(frequency):
     found = read(still(angle=swing(frequency)), *GAIT)
     assert found["gait_frequency_hz"] == pytest.approx(frequency, abs=2e-3)
@@ -179,24 +156,6 @@ def test_a_wave_along_the_joints(frequency):
     spread = math.sqrt(-2 * math.log((1 + 2 * math.cos(0.7)) / 3))
     assert found["gait_phase_spread_rad"] == pytest.approx(spread, abs=5e-3)
     assert found["joint_amplitude_rad"] == pytest.approx(0.4, rel=0.02)
-
-
-def test_phases_count_by_their_amplitudes():
-    """Of two a quarter of a turn apart, one thrice as wide: R = √(3² + 1²) / 4."""
-    found = read(still(angle=swing(1.3, (0, np.pi / 2), (0.6, 0.2))), *GAIT)
-    spread = math.sqrt(-2 * math.log(math.sqrt(10) / 4))
-    assert found["gait_phase_spread_rad"] == pytest.approx(spread, rel=1e-3)
-    assert found["gait_phase_lag_rad"] == pytest.approx(np.pi / 2, rel=1e-3)
-    assert found["joint_amplitude_rad"] == pytest.approx(0.4, rel=0.01)
-
-
-def test_joints_in_phase_and_in_antiphase():
-    together = read(still(angle=swing(1.3, (0, 0, 0))), *GAIT)
-    assert together["gait_phase_spread_rad"] == pytest.approx(0.0, abs=2e-3)
-    assert together["gait_phase_lag_rad"] == pytest.approx(0.0, abs=1e-4)
-    against = read(still(angle=swing(1.3, (0, np.pi), (0.4, 0.4))), *GAIT)
-    assert abs(against["gait_phase_lag_rad"]) == pytest.approx(np.pi, abs=1e-3)
-    assert against["gait_phase_spread_rad"] == pytest.approx(math.sqrt(2 * math.log(1e3)))
 
 
 def test_the_stronger_of_two_frequencies_is_the_gaits():
@@ -209,25 +168,16 @@ def test_the_stronger_of_two_frequencies_is_the_gaits():
     "angle",
     [
         np.full((90, 3), 0.4),  # held
-        0.005 * swing(1.3) / 0.4,  # trembling
         np.linspace(0, 1, 90)[:, None],  # turned once
-        swing(0.1),  # less than a period
         swing(1.0)[:3],  # too short a record
         np.zeros((90, 0)),  # no joints
     ],
-    ids=["held", "trembling", "turned", "slow", "short", "none"],
+    ids=["held", "turned", "short", "none"],
 )
 def test_what_is_no_gait_has_no_frequency(angle):
     found = read(still(angle=angle), *GAIT)
     assert [found[name] for name in GAIT[:3]] == [0.0, 0.0, 0.0]
     assert 0 <= found["joint_amplitude_rad"] < 1
-
-
-def test_hinges_that_a_robot_lacks_change_nothing():
-    """As in a batch of different bodies: rows of zeros behind the robot's own."""
-    alone = still(angle=swing(1.3, (0.0, 0.7, 1.1), (0.2, 0.4, 0.3)))
-    rows = replace(alone, angle=jnp.pad(alone.angle, ((0, 0), (0, 4), (0, 0))))
-    assert read(rows, *GAIT) == pytest.approx(read(alone, *GAIT), rel=1e-4)
 
 
 def test_measures_leave_the_scores_gradient_whole():
@@ -244,9 +194,6 @@ def test_measures_leave_the_scores_gradient_whole():
     slopes = jax.grad(loss, (0, 1, 2))(given.angle, given.quat, given.bed_force)
     assert np.all(np.asarray(slopes[0]) == 1)
     assert all(np.all(np.isfinite(x)) for x in slopes)
-
-
-# ------------------------------------------------------------------ configurations
 
 
 def test_names_are_read_written_and_checked(tmp_path):

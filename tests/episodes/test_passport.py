@@ -1,7 +1,5 @@
 """Passports: what drifts, chatters or overlaps fails where it should; same seed, same bits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax

@@ -1,7 +1,5 @@
 """`task.robust`: coefficients drawn for each trial, for one body and for many."""
 
-from __future__ import annotations
-
 import jax
 import numpy as np
 import pytest

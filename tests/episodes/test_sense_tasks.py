@@ -1,7 +1,5 @@
 """Tasks that need senses: scores of known tracks, and the same pursuer wherever it swims."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_revolve import make_fitness, make_mixed_fitness
-from mjx_revolve.episodes.config import TaskConfig, load_config
+from mjx_revolve import make_fitness
+from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.tasks import TASKS, Track
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -78,12 +76,6 @@ def test_escape_counts_the_nearest_and_how_late(robot, pursuer, score):
     assert judge("escape", given) == pytest.approx(score, abs=1e-6)
 
 
-def test_to_dive_is_no_escape():
-    given = track(along_x(0, 0, z=-1.0), target=along_x(9, 9))
-    assert judge("escape", given, depth_tolerance=0.4) == 0.0
-    assert judge("escape", given, depth_tolerance=1.1) == pytest.approx(1.0)
-
-
 def test_a_course_is_followed_from_row_to_row():
     """1 m along x, 2 m along y; the course is x in the first two rows, then y."""
     way, course = [[0, 0, 0], [1, 0, 0], [1, 2, 0], [1, 4, 0]], [[1, 0, 0]] * 2 + [[0, 1, 0]] * 2
@@ -107,8 +99,6 @@ def test_scores_have_a_gradient_where_nothing_is_left(name):
 
         assert np.isfinite(jax.grad(score)(given.position)).all()
 
-
-# ------------------------------------------------------------------ whole episodes
 
 CHASED = {
     "task.duration": 2.0, "task.settle": 0.2, "task.trials": 2, "task.target_distance": 0.4,
@@ -146,33 +136,3 @@ def test_a_pursuer_is_the_robots_own(chased):
     start = np.asarray(one.starts(key)[0])[:3, 0]
     first = np.linalg.norm(place[0] - start)
     assert first == pytest.approx(0.4 - 0.3 * one.robot.world.timestep, abs=1e-4)
-
-
-@pytest.mark.long
-def test_bodies_in_a_batch_are_pursued_alike(chased):
-    fitness, genes, _ = chased
-    many = make_mixed_fitness(fitness.config, [fitness.robot.morphology])
-    robot = many.build(fitness.robot.morphology)
-    key = jax.random.key(2)
-    found = np.asarray(many([robot], genes[None, :1], key))[0]
-    assert found == pytest.approx(np.asarray(fitness(genes[:1], key)), abs=1e-4)
-    (trajectory,) = many.replay([robot], [genes[0]], key)
-    alone = fitness.replay(genes[0], key)
-    rows = np.searchsorted(np.asarray(alone.time), np.asarray(trajectory.time) - 1e-6)
-    assert np.asarray(trajectory.target) == pytest.approx(np.asarray(alone.target)[rows], abs=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("name", "task", "genes"),
-    [
-        # Per thruster a bias and its answers to each number, and a frequency that nobody has.
-        ("auv_follow_course", "follow_course", 1 + 4 * (1 + 3 + 3 + 3 + 1 + 1)),
-        ("auv_search", "search", 1 + 4 * (1 + 3 + 3 + 3 + 1 + 1)),
-        ("auv_escape", "escape", 1 + 4 * (1 + 3 + 1 + 3 + 3 + 1 + 1)),
-        ("auv_hold_heading", "hold_heading", 1 + 4 * (1 + 3 + 3 + 1 + 1 + 3)),
-    ],
-)
-def test_shipped_configurations(name, task, genes):
-    fitness = make_fitness(name)
-    assert fitness.config.task.type == task and fitness.num_genes == genes
-    assert load_config(ROOT / "configs" / f"{name}.yaml").task == fitness.config.task

@@ -169,21 +169,6 @@ def test_a_current_carries_what_keeps_still(tank, robots):
     assert np.allclose(speed[:2], (0.2, -0.1), rtol=0.05)
 
 
-@pytest.mark.slow
-def test_worlds_side_by_side_are_alike(mixed, robots):
-    """Two worlds with the same robots in the same places: the same bits."""
-    water = make_tank(mixed, 2, worlds=2, spheres=8)
-    for world in range(2):
-        for k in range(2):
-            water.add(
-                robots[k], genes(mixed, robots[k], k), (0.15 * k, 0, -1), world=world, noise=k
-            )
-    trail = water.advance(1.0, 0.1)
-    assert np.array_equal(trail.qpos[..., :2], trail.qpos[..., 2:])
-    with pytest.raises(InputError, match="expected a free place; found all 2 taken"):
-        water.add(robots[0], None, (0, 0, -1), world=1)
-
-
 def test_what_cannot_be_is_refused(tank, mixed, robots):
     water = tank()
     with pytest.raises(InputError, match="robot in place 0; found none"):

@@ -1,14 +1,14 @@
 """Slopes by genes through sensors, networks, servos and water, whole episodes and windows."""
 
-from __future__ import annotations
+from functools import cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import OAR, QUICK, SLOPE, swimmer
-from mjx_revolve import InputError, load_morphology, make_fitness, make_mixed_fitness
+from laboratory import OAR, swimmer
+from mjx_revolve import InputError, make_fitness
 from mjx_revolve.episodes.scoring import WORST
 from mjx_revolve.episodes.windows import make_windows
 
@@ -61,41 +61,32 @@ def check_gradient(value, genes, gradient, count=6):
         assert gradient @ way == pytest.approx((ahead - behind) / 2e-6, rel=1e-4, abs=1e-4 * size)
 
 
-def mean_gain(windows, episodes):
-    """Genes → the mean gain of a window, for differences."""
-    return lambda genes: np.mean(windows.step(genes[None], episodes)[0].gain)
+@pytest.fixture(scope="module")
+def whole(settings):
+    """Makes windows of all of 0.4 s for a brain; two individuals share a program."""
+    return cache(
+        lambda kind: make_windows(make_fitness(listening(settings, kind), **{"task.duration": 0.4}))
+    )
+
+
+def mean_gain(windows, episodes, other):
+    """Genes → the mean gain of a window beside another individual, for differences."""
+    return lambda genes: np.mean(windows.step(jnp.stack([genes, other]), episodes)[0].gain[0])
 
 
 @pytest.mark.slow
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", BRAINS)
-def test_closed_loop_gradients_are_those_of_differences(settings, kind):
+def test_closed_loop_gradients_are_those_of_differences(whole, kind):
     """Through sensors with noise, brain, servos and water, in float64, over 0.4 s."""
     with jax.enable_x64(True):
-        fitness = make_fitness(listening(settings, kind), **{"task.duration": 0.4})
-        windows, genes = make_windows(fitness), drawn(1, fitness.num_genes)
+        windows = whole(kind)
+        genes = drawn(2, windows.fitness.num_genes)
         episodes = windows.init(genes, KEY)
         gradients, _ = windows.step(genes, episodes)
-        gradient = np.asarray(gradients.gradient).mean((0, 1))
-        check_gradient(mean_gain(windows, episodes), np.asarray(genes[0]), gradient)
-
-
-@pytest.mark.long
-def test_gradients_for_many_bodies_are_those_of_differences(settings, tmp_path):
-    """A closed loop of two different bodies side by side, by JAX's own gradient."""
-    (tmp_path / "turned.yaml").write_text(
-        OAR.replace("ActiveHinge,", "ActiveHinge, orientation: 90,")
-    )
-    bodies = [load_morphology(x) for x in (settings["morphology"], tmp_path / "turned.yaml")]
-    brain = {"type": "mlp", "hidden": 2, "sensors": ["tilt", {"type": "angle", "noise": 0.05}]}
-    task = TASK | {"duration": 0.2, "settle": 0.0, "trials": 1}
-    with jax.enable_x64(True):
-        many = make_mixed_fitness(settings | {"controller": brain, "task": task}, bodies)
-        packed, genes = many.pack([many.build(x) for x in bodies]), drawn(2, many.num_genes)
-        total = lambda x: jnp.sum(many(packed, x.reshape(2, -1), KEY))  # noqa: E731
-        both = jax.jit(jax.value_and_grad(total), compiler_options=SLOPE)
-        gradient = np.asarray(both(genes.reshape(-1))[1])
-        check_gradient(lambda x: both(x)[0], np.asarray(genes.reshape(-1)), gradient, 4)
+        gradient = np.asarray(gradients.gradient).mean(1)[0]
+        value = mean_gain(windows, episodes, genes[1])
+        check_gradient(value, np.asarray(genes[0]), gradient)
 
 
 @pytest.fixture(scope="module")
@@ -140,31 +131,14 @@ def test_windows_carried_on_are_one_long_rollout(brain, windows):
             windows.step(genes, episodes)
         new = genes[::-1]
         gradient = np.asarray(windows.step(new, before)[0].gradient).mean(1)[0]
-
-        def value(own):
-            return np.mean(windows.step(jnp.stack([own, new[1]]), before)[0].gain[0])
-
+        value = mean_gain(windows, before, new[1])
         check_gradient(value, np.asarray(new[0]), gradient, 3)
 
 
-@pytest.mark.long
-def test_memory_grows_with_the_state_and_not_with_the_steps_working(windows):
-    """XLA's own sum of what lives beside arguments and results."""
-    with jax.enable_x64(True):  # as above, so that nothing is compiled again
-        population = jnp.zeros((2, windows.fitness.num_genes))
-        episodes = jax.eval_shape(windows.init, population, KEY)
-        step = jax.jit(windows.step, compiler_options=QUICK)
-        compiled = step.lower(population, episodes).compile()
-    steps = windows.horizon / windows.fitness.robot.world.timestep
-    carried = sum(x.size for x in jax.tree.leaves(episodes.rollout)) / 4  # for each lane
-    # A step of a lane keeps 8 bytes for each number that it carries, its water, and some more while
-    # gradients by the parameters of a record are found; its working is some thousand numbers.
-    assert compiled.memory_analysis().temp_size_in_bytes / (64 * steps) < 4 * 8 * carried
-
-
 @pytest.mark.slow
-def test_what_blows_up_has_no_gradient_and_spreads_none(windows):
+def test_what_blows_up_has_no_gradient_and_spreads_none(whole):
     with jax.enable_x64(True):
+        windows = whole("mlp")
         genes = drawn(2, windows.fitness.num_genes)
         broken = genes.at[1].set(jnp.nan)
         (one, _), (other, _) = (windows.step(x, windows.init(x, KEY)) for x in (genes, broken))

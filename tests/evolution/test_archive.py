@@ -19,7 +19,6 @@ from mjx_revolve.evolution.archive import (
     to_arrays,
     to_ribs,
 )
-from mjx_revolve.inputs.errors import InputError
 
 NAN, INF = np.nan, np.inf
 FIELDS = ("names", "lows", "highs", "shape", "centers", "ids", "scores", "points")
@@ -148,32 +147,7 @@ def test_archives_come_back_from_a_file_as_they_were(make):
     assert same(insert(archive, *more), insert(again, *more))
 
 
-def test_rows_of_a_table():
-    points = np.array([[9, 0.25], [1, 0.0]])
-    archive = insert(grid(), np.array([7, 3]), np.array([0.5, 2.0]), points)
-    assert rows(grid()) == []
-    one, five = rows(archive)
-    assert one == {
-        "cell": 1, "id": 3, "score": 2.0,
-        "num_modules": 1.0, "num_modules_center": 4.5, "num_modules_cell": 0,
-        "speed": 0.0, "speed_center": pytest.approx(0.0), "speed_cell": 1,
-    }  # fmt: skip
-    assert (five["cell"], five["num_modules_cell"], five["speed_cell"]) == (5, 1, 2)
-    archive = insert(tessellation(), np.array([7]), np.array([0.5]), points[:1])
-    assert [*rows(archive)[0]] == [
-        "cell", "id", "score", "num_modules", "num_modules_center", "speed", "speed_center",
-    ]  # fmt: skip
-
-
-# ------------------------------------------------------------------ ribs
-
 NO_RIBS = "ribs is not installed (pip install 'ribs>=0.12,<0.13')"
-
-
-def test_ribs_is_asked_for_by_name_where_it_is_missing(monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"package ribs; found none .*'ribs>=0.12,<0.13'"):
-        to_ribs(grid(), [])
 
 
 @pytest.mark.slow
@@ -199,14 +173,3 @@ def test_ribs_opens_an_archive_with_the_same_cells(make):
     assert len(to_ribs(make(), [])) == 0
     with pytest.raises(ValueError, match=r"expected \d+ solutions"):
         to_ribs(archive, solutions[1:])
-
-
-def test_ribs_and_we_round_alike_at_borders():
-    pytest.importorskip("ribs", reason=NO_RIBS)
-    axes = {name: {"low": -0.3, "high": 0.7, "cells": 10} for name in "ab"}
-    archive = grid(**axes)
-    borders = np.linspace(-0.3, 0.7, 11)
-    points = np.stack(np.meshgrid(borders, borders), axis=-1).reshape(-1, 2)
-    archive = insert(archive, np.arange(121), np.arange(121.0), points)
-    found = to_ribs(archive, filled(archive).tolist())
-    assert (found.data("index") == found.data("solution").astype(int)).all()

@@ -37,7 +37,6 @@ def quick_compiles(monkeypatch):
 
 @pytest.mark.slow
 def test_the_smallest_run(tmp_path, monkeypatch, capsys, quick_compiles):
-    """Scores are those of each individual alone, to the bit, and the champion can be replayed."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("mjx_revolve.view.results.save_pictures", lambda run, champion: None)
     (tmp_path / "small.yaml").write_text(json.dumps(CONFIG))
@@ -80,7 +79,6 @@ def score(executor, one, key):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["lake_coevolve", "bed_coevolve", "lake_map_elites"])
 def test_shipped_configurations(name):
-    """They are whole, and there is room for all bodies that they grow."""
     config = load_config(find_shipped(name, "configs"))
     fitness = make_body_fitness(config)
     BodyEvolution(config, Executor(fitness, fitness.block_size))

@@ -13,7 +13,6 @@ from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.bodies_config import BrainsConfig
 from mjx_revolve.evolution.brains import gene_layout, make_brain_encoding
-from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.world import load_world
 
 SNAKE = body("snake")
@@ -41,7 +40,6 @@ def shorter():
 
 
 def test_places_of_genes():
-    """A hinge's genes stand where it turns; a pair's between its two hinges."""
     layout = layout_of(SNAKE, make_cpg)
     anchors = []
     for index in SNAKE.hinges:
@@ -91,7 +89,6 @@ def test_a_child_with_its_parents_body_has_its_genes():
 
 
 def test_a_joint_that_has_grown_does_as_the_nearest():
-    """A hinge more at the snake's end takes over what the last one had; the others keep theirs."""
     brains = make_brain_encoding(BrainsConfig(mutation=0.0), common())
     small = layout_of(shorter(), common=common())
     parent = brains.draw(np.random.default_rng(0), small)
@@ -116,7 +113,6 @@ def test_of_two_parents_the_first_ones_joints_come_first():
 
 
 def test_a_copy_does_as_its_original():
-    """Of a limb that was doubled; one that a second parent gave does as it did there."""
     brains = make_brain_encoding(BrainsConfig(mutation=0.0), common())
     bare = add_module(body("core"), 0, 0, "ActiveHinge", name="fin")
     bare = add_module(bare, 0, 1, "ActiveHinge", name="leg")
@@ -131,20 +127,7 @@ def test_a_copy_does_as_its_original():
     assert child["u fin_2"] == -1 and child["u fin"] == parent["u fin"]
 
 
-def test_a_limb_where_there_was_none():
-    """With nobody to learn from, genes are drawn."""
-    brains = joints(std_init=0.5, mutation=0.0)
-    bare = body("core")
-    one = add_module(bare, 0, 0, "ActiveHinge", name="first")
-    layout = layout_of(one, common=common())
-    child = brains.inherit(np.random.default_rng(0), [{"frequency": 0.7}], layout)
-    assert child["frequency"] == np.float32(0.7)
-    drawn = [child[name] for name in layout.names if name != "frequency"]
-    assert len(drawn) == 3 and all(drawn)
-
-
 def test_the_network_by_hand():
-    """With one weight from x to the first kind of gene, those genes are x in units of .1 m."""
     brains, layout = make_brain_encoding(BrainsConfig(type="cppn"), common()), layout_of(SNAKE)
     weights = np.zeros(brains.size, np.float32)
     hidden, inputs = 12, 7
@@ -166,20 +149,3 @@ def test_the_network_by_hand():
     for gene, place, value in zip(layout.genes, layout.place, genes, strict=True):
         expected = np.sin(30 * place[1]) if gene.what == "u" else 0.0
         np.testing.assert_allclose(value, expected, rtol=1e-5, atol=1e-7)
-
-
-def test_network_children():
-    """Each weight comes of one of the parents."""
-    brains = make_brain_encoding(BrainsConfig(type="cppn", mutation=0.0), common())
-    ones, twos = [1.0] * brains.size, [2.0] * brains.size
-    child = brains.inherit(np.random.default_rng(0), [ones, twos], layout_of(SNAKE))
-    share = child.count(1.0) / brains.size
-    assert set(child) == {1.0, 2.0} and 0.3 < share < 0.7
-    assert brains.inherit(np.random.default_rng(0), [ones], layout_of(SNAKE)) == ones
-
-
-@pytest.mark.parametrize(("kind", "brain"), [("joints", [1.0]), ("joints", {"a": "b"}),
-                                            ("cppn", {}), ("cppn", [1.0, 2.0])])  # fmt: skip
-def test_damaged_brains(kind, brain):
-    with pytest.raises(InputError, match="brain: expected"):
-        make_brain_encoding(BrainsConfig(type=kind), common()).check(brain)

@@ -3,13 +3,10 @@
 The tests share them, in the order in which they stand here.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
 import sys
-import threading
 
 import jax
 import numpy as np
@@ -17,13 +14,12 @@ import pytest
 
 import toys
 from laboratory import ROOT, XLA_FLAGS
-from mjx_revolve import evolve as command
 from mjx_revolve import sweep
 from mjx_revolve.episodes.config import load_config
 from mjx_revolve.evolution import jobs
 from mjx_revolve.evolution import run_folder as runs
 from mjx_revolve.evolution.executor import Executor, make_executor
-from mjx_revolve.evolution.jobs import Limits, WorkerError
+from mjx_revolve.evolution.jobs import Limits
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from toys import CLOCK, wait_for
@@ -120,7 +116,6 @@ def test_workers_may_join_at_any_time(cluster, executor, caplog):
 
 
 def test_a_sweep_has_the_workers_of_a_cluster(cluster, executor, tmp_path, monkeypatch, capsys):
-    """The same bits as in this process, over several runs that share its workers."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("mjx_revolve.view.results.save_pictures", lambda start, champion: None)
     toys.write_config(tmp_path / "toy.yaml", population_size=8, generations=3)
@@ -151,19 +146,6 @@ def test_a_lost_worker_costs_nothing(cluster, executor, kind, caplog):
     ]
 
 
-@pytest.mark.long
-def test_a_block_that_kills_scores_worst_and_is_named(executor, caplog):
-    population = np.random.default_rng(4).normal(size=(10, 5)).astype(np.float32)
-    population[5] = 200.0
-    scores, _ = executor.evaluate(population, KEY)
-    alone, _ = Executor(toys.Toy(), 4).evaluate(population, KEY)
-    assert np.isnan(scores[4:8]).all()
-    rest = [0, 1, 2, 3, 8, 9]
-    assert scores[rest].tobytes() == alone[rest].tobytes()
-    assert sum("is gone" in line for line in said(caplog)[:-1]) >= 2
-    assert said(caplog)[-1].startswith("4 individuals count as failed, because their workers do")
-
-
 def test_workers_of_another_source_are_refused(cluster, executor, config, caplog, tmp_path):
     shutil.copytree(ROOT / "mjx_revolve", tmp_path / "mjx_revolve")
     with open(tmp_path / "mjx_revolve" / "water" / "drag.py", "a") as file:
@@ -186,53 +168,6 @@ def test_workers_of_another_source_are_refused(cluster, executor, config, caplog
     )
     check_scores(executor, 5)
     assert worker.blocks == []
-
-
-@pytest.mark.long
-def test_a_lost_scheduler_ends_the_run_which_goes_on_elsewhere(
-    cluster, executor, config, capsys, monkeypatch, tmp_path
-):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("TOY_TROUBLE", str(tmp_path / "none"))
-    monkeypatch.setattr("mjx_revolve.evolution.cluster._FETCH", 3.0)  # it waits so long, in vain
-    toys.write_config(tmp_path / "toy.yaml", population_size=10, generations=5000)
-
-    def run(*argv):
-        return run_command(
-            lambda argv: command.main(argv, toys.make_troubled), [str(word) for word in argv]
-        )
-
-    def kill():
-        wait_for((tmp_path / "run" / "metrics.csv").exists)
-        cluster.scheduler.kill()
-
-    killer = threading.Thread(target=kill)
-    killer.start()
-    with dask.config.set({"distributed.comm.timeouts.connect": "2s"}):
-        assert run("toy.yaml", "--out", "run", "--cluster", cluster.file) == 1
-        killer.join()
-        error, resume = [
-            line for line in capsys.readouterr().err.splitlines()
-            if line.startswith(("error: ", "resume: "))
-        ]  # fmt: skip
-        assert error.startswith(f"error: the scheduler at {cluster.file} is lost; generation ")
-        assert error.endswith(" is saved")
-        done = int(error.split()[-3])
-        assert resume.endswith(" -m mjx_revolve.evolve --resume run")
-        more = ("--set", f"evolution.generations={done + 3}")
-        assert run("--resume", "run", "--workers", 1, *more) == 0
-        assert run("toy.yaml", "--out", "whole", "--workers", 1, *more) == 0
-        one, other = (
-            runs.RunFolder(tmp_path / name).load_checkpoint().arrays for name in ("run", "whole")
-        )
-        assert one.keys() == other.keys()
-        for name in one.keys() - set(CLOCK):
-            assert one[name].tobytes() == other[name].tobytes(), name
-        # There is nobody at that address any more.
-        with pytest.raises(InputError, match=f"--cluster {cluster.file}: expected a Dask schedule"):
-            make_executor(config, None, toys.make_toy, str(cluster.file))
-    with pytest.raises(WorkerError, match="is lost"):
-        check_scores(executor, 7)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ from mjx_revolve.evolution.generations import run_generations
 from mjx_revolve.evolution.individuals import from_record, to_record
 from mjx_revolve.evolution.learning import learn, score_brains
 from mjx_revolve.inputs.commands import run_command
-from mjx_revolve.inputs.errors import InputError
 from toys import CLOCK, make_toy_bodies
 
 
@@ -66,9 +65,6 @@ def main(*argv):
     return run_command(lambda argv: command.main(argv, make_toy_bodies), [str(a) for a in argv])
 
 
-# --- learning ---
-
-
 def founders(config, executor):
     evolution = BodyEvolution(config, executor)
     return evolution.ask(evolution.start()).offspring
@@ -86,7 +82,6 @@ def test_learning_does_not_depend_on_the_other_bodies(folder):
 
 
 def test_learning_improves_and_is_what_counts(folder):
-    """One trial is the brain of birth; more find better ones, and the score is the best one's."""
     config, executor = start(folder)
     born, key = founders(config, executor), jax.random.key(0)
     naive = learn(executor, born, key)
@@ -148,8 +143,6 @@ def test_those_that_fail_have_no_score(folder):
     assert all(individual.body.num_hinges >= 3 for individual in search.elites)
 
 
-# --- generations ---
-
 SCHEMES = [
     {"type": "plus"},
     {"type": "comma", "offspring": 9},
@@ -165,7 +158,6 @@ SCHEMES = [
 @pytest.mark.slow
 @pytest.mark.parametrize("selection", SCHEMES, ids=lambda s: s["type"])
 def test_generations(folder, selection):
-    """The bookkeeping of all schemes, and that the same seed gives the same bits."""
     config, executor = start(folder, {"selection": selection})
     search, rows = run(config, executor)
     per = selection.get("offspring", 6)
@@ -191,7 +183,6 @@ def test_generations(folder, selection):
 
 @pytest.mark.slow
 def test_evolution_finds_the_optimum(folder):
-    """Three hinges, and genes near a half: far above what random search finds."""
     found = {}
     for kind in ("plus", "random"):
         bodies = {"selection": {"type": kind}, "brains": {"mutation": 0.1}}
@@ -206,7 +197,6 @@ def test_evolution_finds_the_optimum(folder):
 
 @pytest.mark.slow
 def test_inheritance(folder):
-    """Children begin with what their parents learnt, were born with, or with nothing of either."""
     learning = {"population_size": 8, "generations": 4, "std_init": 0.5}
     for how in ("lamarckian", "darwinian", "none"):
         brains = {"inheritance": how, "mutation": 0.0}
@@ -248,28 +238,6 @@ def test_seeds_begin_the_population(folder):
     assert first[2].body.modules != first[0].body.modules
 
 
-LEARNING = {"generations": 2, "population_size": 4}
-
-
-@pytest.mark.parametrize(("bodies", "message"), [
-    ({"seeds": ["snake"]}, r"snake.yaml: expected 2 to 8 modules; found"),
-    ({"seeds": ["snake"], "genotype": "cppn", "max_modules": 30, "max_hinges": 10},
-     "bodies.seeds: expected none"),
-    ({"params": {"nope": 1}}, "bodies.params.nope"),
-    ({"learning": {"generations": 2}}, "bodies.learning.population_size: expected at least 2"),
-    ({"learning": LEARNING | {"strategy": "nope"}}, "bodies.learning.strategy"),
-    ({"selection": {"type": "nsga2", "objectives": ["score", "sped"]}}, "objectives: expected"),
-    ({"archive": {"axes": {"num_hinges": {"low": 0, "high": 4}, "x": {"low": 0, "high": 1}}}},
-     "archive.axes: expected"),
-    ({"selection": {"type": "comma", "offspring": 2}}, "offspring"),
-])  # fmt: skip
-def test_wrong_settings(folder, bodies, message):
-    with pytest.raises(InputError, match=message):
-        BodyEvolution(*start(folder, bodies))
-
-
-# --- the archive ---
-
 ARCHIVE = {
     "selection": {"type": "map_elites", "offspring": 8},
     "archive": {"axes": {"num_hinges": {"low": 0.5, "high": 4.5, "cells": 4},
@@ -288,9 +256,6 @@ def test_map_elites_keeps_the_best_of_each_kind(folder):
         assert {i.number for i in search.living} == {i.number for i in best.values()}
         assert row["coverage"] == pytest.approx(len(best) / 28)
     assert len(best) > 12
-
-
-# --- run folders ---
 
 
 def contents(folder):
@@ -352,16 +317,7 @@ def test_what_is_in_a_run_folder(folder, capsys):
 
 
 @pytest.mark.slow
-def test_a_run_cannot_become_another(folder, no_pictures, capsys):
-    assert main("toy.yaml", "--out", "run", "--set", "evolution.generations=2") == 0
-    for name, value in (("bodies.max_modules", 9), ("bodies.selection.type", "steady")):
-        assert main("--resume", "run", "--set", f"{name}={value}") == 2
-        assert ".".join(name.split(".")[:2]) in capsys.readouterr().err
-
-
-@pytest.mark.slow
 def test_workers_change_nothing(folder, no_pictures):
-    """The same bits from this process and from two others."""
     toys.write_bodies_config(folder / "toy.yaml", {"learning": {"population_size": 6}})
     assert main("toy.yaml", "--out", "one", "--set", "evolution.generations=2") == 0
     argv = ("toy.yaml", "--out", "two", "--workers", "2", "--set", "evolution.generations=2")

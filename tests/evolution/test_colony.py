@@ -5,12 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import yaml
 
 from laboratory import QUICK, ROOT
 from mjx_revolve.episodes.colony_config import ColonyConfig, EnergyConfig, LifeConfig
 from mjx_revolve.episodes.config import load_config, make_config
-from mjx_revolve.episodes.individual_log import read_generations, read_individuals
 from mjx_revolve.episodes.tank import TankTrajectory
 from mjx_revolve.evolution.body_fitness import make_body_fitness
 from mjx_revolve.evolution.colony import (
@@ -32,7 +30,6 @@ from mjx_revolve.evolution.colony_search import ColonyEvolution
 from mjx_revolve.evolution.executor import make_executor
 from mjx_revolve.evolution.generations import run_generations
 from mjx_revolve.evolution.reproduction import make_founder
-from mjx_revolve.evolve import main
 from mjx_revolve.inputs.errors import InputError
 
 SETTINGS = {
@@ -275,28 +272,6 @@ def test_it_goes_on_from_any_checkpoint_bit_for_bit(history, config):
             assert np.array_equal(last[name][..., here], same[name][..., here]), name
 
 
-@pytest.mark.long
-def test_the_command_writes_and_resumes_a_run(tmp_path, history, capsys):
-    """Stopped after five intervals and resumed, its events are those of `history`."""
-    path, run = tmp_path / "colony.yaml", tmp_path / "run"
-    path.write_text(yaml.safe_dump(SETTINGS))
-    assert main([str(path), "--out", str(run), "--set", "evolution.generations=5"]) == 0
-    assert main(["--resume", str(run), "--set", "evolution.generations=10"]) == 0
-    searches = [search for search, _ in history[0][:10]]
-    events = [json.loads(line) for line in (run / "events.jsonl").read_text().splitlines()]
-    assert events == json.loads(json.dumps([e for search in searches for e in search.events]))
-    living, _ = read_generations(run)
-    assert living == {s.generation: tuple(i.number for i in s.living) for s in searches}
-    individuals, wrong = read_individuals(run)
-    assert not wrong and sorted(individuals) == list(range(searches[-1].next_number))
-    ended = {i.number: i.score for search in searches for i in search.died}
-    for number, score in ended.items():
-        assert individuals[number].score == pytest.approx(score, nan_ok=True)
-    assert (run / "champion" / "genes.yaml").is_file()
-    out = capsys.readouterr().out
-    assert "champion:" in out and "interval 10/10" in out
-
-
 def test_what_cannot_be_a_colony_is_refused():
     def wrong(**changes):
         data = {**SETTINGS, **changes}
@@ -318,16 +293,6 @@ def test_what_cannot_be_a_colony_is_refused():
         colony={**colony, "look": 5.0}
     )
     assert "colony.arena.edge: expected" in wrong(colony={**colony, "arena": {"edge": "wall"}})
-
-
-def test_a_gusty_world_is_refused(config):
-    gust = {"std": 0.1, "time": 2.0}
-    data = {**SETTINGS, "world": {"name": "lake", "bed": False, "gust": gust}}
-    with (
-        pytest.raises(InputError, match="without gusts"),
-        make_executor(make_config(data, ROOT), workers=1) as executor,
-    ):
-        ColonyEvolution(executor.fitness.config, executor)
 
 
 def test_the_shipped_configuration():

@@ -1,8 +1,5 @@
 """Faults of machine and disk, done to runs for real: what each costs, and what is said."""
 
-from __future__ import annotations
-
-import datetime
 import os
 import shutil
 import subprocess
@@ -16,10 +13,7 @@ import toys
 from laboratory import ROOT, XLA_FLAGS
 from mjx_revolve import evolve
 from mjx_revolve.evolution import memory
-from mjx_revolve.evolution import run as runs
-from mjx_revolve.evolution.run_folder import RunFolder
 from mjx_revolve.inputs.commands import run_command
-from mjx_revolve.view.report.data import read_run
 
 
 @pytest.fixture
@@ -105,48 +99,6 @@ def test_a_full_and_a_read_only_disk(folder):
     assert "Traceback" not in done.stderr
 
 
-def test_a_folder_that_is_removed(folder, capsys):
-    assert run_main("toy.yaml", "--out", "run", at=4, do=lambda: shutil.rmtree("run")) == 1
-    err = capsys.readouterr().err
-    assert err == f"error: {folder / 'run' / 'metrics.csv'}: No such file or directory\n"
-
-
-@pytest.mark.slow
-def test_a_second_run_in_one_folder_is_refused(folder, capsys):
-    codes = []
-
-    def begin_more():
-        codes.append(run_main("--resume", "run"))
-        codes.append(run_main("toy.yaml", "--out", "run"))
-
-    assert run_main("toy.yaml", "--out", "run", at=2, do=begin_more) == 0
-    assert codes == [2, 2]
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-    assert "run: expected a run that has stopped; found it running" in lines[0]
-    assert "run: expected a new or empty folder; found files" in lines[1]
-    assert run_main("toy.yaml", "--out", "alone") == 0
-    assert genes("run") == genes("alone")
-
-
-@pytest.mark.slow
-def test_a_clock_that_goes_backwards(folder, monkeypatch):
-    assert run_main("toy.yaml", "--out", "whole") == 0
-
-    def turn_back():
-        past = datetime.datetime(2001, 1, 1)
-        clock = SimpleNamespace(datetime=SimpleNamespace(now=lambda: past))
-        monkeypatch.setattr(runs, "datetime", clock)
-        raise RuntimeError
-
-    with pytest.raises(RuntimeError):
-        run_main("toy.yaml", "--out", "run", at=4, do=turn_back)
-    assert run_main("--resume", "run") == 0
-    assert genes("run") == genes("whole")
-    info = RunFolder(folder / "run").info
-    assert info["finished"] < info["started"]
-    assert not read_run("run").problems
-
-
 def test_a_population_beyond_the_memory_is_refused_beforehand(folder, capsys):
     huge = "evolution.population_size=1000000000000"
     for more in ((), ("--set", "evolution.strategy=DifferentialEvolution")):
@@ -180,25 +132,6 @@ def test_the_largest_population_fits(tmp_path, folder, monkeypatch):
             else:
                 with pytest.raises(ValueError, match=f"at most {most},"):
                     memory.check_memory(config_of(strategy, most + 1), 5)
-
-
-@pytest.mark.slow
-def test_bodies_beyond_the_memory_are_refused_beforehand(folder, capsys):
-    toys.write_bodies_config(folder / "bodies.yaml")
-
-    def run(*settings):
-        argv = ["bodies.yaml", "--out", "run", *(x for s in settings for x in ("--set", s))]
-        return run_command(lambda argv: evolve.main(argv, toys.make_toy_bodies), argv)
-
-    for settings, place in (
-        (["evolution.population_size=1000000000"], "evolution.population_size"),
-        (["bodies.selection.offspring=1000000000"], "bodies.selection.offspring"),
-    ):
-        assert run(*settings) == 2
-        err = capsys.readouterr().err
-        assert f"--set {place}: expected at most " in err
-        assert err.endswith(" GB of memory are free; found 1000000000\n")
-        assert not os.path.exists("run")
 
 
 def config_of(strategy, size):

@@ -71,15 +71,6 @@ def timeless(row):
     return {name: value for name, value in row.items() if name not in CLOCK}
 
 
-# --- scores to losses ---
-
-
-def test_losses_are_negated_scores():
-    losses = losses_from_scores(np.float32([1.0, -2.0, 3.0]))
-    assert losses.dtype == np.float32
-    assert losses.tolist() == [-1.0, 2.0, -3.0]
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_failures_lose_by_the_spread_of_the_others(bad):
     losses = losses_from_scores(np.array([1.0, bad, -2.0, bad]))
@@ -95,24 +86,6 @@ def test_all_failed_and_penalties():
     assert len(set(losses.tolist())) == 4
     assert losses_from_scores(np.array([1.0, np.nan]), -100.0)[1] == 100.0
     assert losses_from_scores(np.array([-1e4, np.nan]), -100.0)[1] > 1e4
-
-
-@pytest.mark.parametrize("value", [0.0, 1e-20, 1.0, -3e8])
-def test_ties_are_broken_by_almost_nothing_even_for_xla(value):
-    losses = losses_from_scores(np.full(64, value, np.float32))
-    assert np.all(np.diff(jnp.asarray(losses)) > 0)
-    # XLA flushes denormals to zero: the ranks that evosax takes must be different there, too.
-    ranks = jax.jit(lambda x: jax.scipy.stats.rankdata(x))(losses)
-    assert np.asarray(ranks).tolist() == list(range(1, 65))
-    assert abs(losses[-1] - losses[0]) <= 64 * max(np.spacing(np.float32(abs(value))), 1e-30)
-
-
-def test_ties_keep_the_order_of_the_others():
-    losses = losses_from_scores(np.array([1.0, 2.0, 1.0, 2.0, 0.0]))
-    assert np.argsort(losses).tolist() == [1, 3, 0, 2, 4]
-
-
-# --- strategies ---
 
 
 QUICK = ("CMA_ES", "OpenES", "SNES", "PGPE")
@@ -144,47 +117,23 @@ def check_optimum(name, within=0.05):
     assert np.allclose(search.elites[0], fitness.target, atol=2 * np.sqrt(within * start))
 
 
-def test_names_are_found_however_written():
-    assert find_strategy("cma-es") == "CMA_ES"
-    assert find_strategy("OpenES") == "Open_ES"
-    assert find_strategy("sep cma es") == "Sep_CMA_ES"
-    assert find_strategy("DE") == "DifferentialEvolution"
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"strategy": "CMA_SE"}, "evolution.strategy: expected one of ARS, "),
-        ({"strategy": "CMA_SE"}, "found 'CMA_SE'; did you mean CMA_ES?"),
-        ({"strategy": "OpenES", "population_size": 15},
+({"strategy": "CMA_SE"}, "found 'CMA_SE'; did you mean CMA_ES?"),
+({"strategy": "OpenES", "population_size": 15},
          "evolution.population_size: expected an even number for Open_ES; found 15"),
-        ({"strategy": "LM_MA_ES", "population_size": 16},
-         "evolution.population_size: expected at most twice the 5 genes for LM_MA_ES; found 16"),
-        ({"strategy_params": {"std_mni": 1.0}},
+({"strategy_params": {"std_mni": 1.0}},
          "evolution.strategy_params.std_mni: expected one of c_1, c_c, c_mean, c_mu, c_std, chi_n, "
          "d_std, mu_eff, std_max, std_min, weights for CMA_ES; found an unknown name"),
-        ({"strategy_params": {"std_min": float("inf")}}, "expected a finite number; found inf"),
-        ({"strategy_params": {"weights": [1, 2]}}, "expected numbers of shape [16]; found [1, 2]"),
-        ({"strategy": "PGPE", "strategy_params": {"learning_rate": -1}},
-         "evolution.strategy_params.learning_rate: expected a number > 0; found -1"),
-        ({"strategy": "DE", "strategy_params": {"elitism": 1}},
-         "evolution.strategy_params.elitism: expected true or false; found 1"),
-    ],
+({"strategy_params": {"weights": [1, 2]}}, "expected numbers of shape [16]; found [1, 2]"),
+({"strategy": "DE", "strategy_params": {"elitism": 1}},
+         "evolution.strategy_params.elitism: expected true or false; found 1")
+],
 )  # fmt: skip
 def test_wrong_strategies(changes, message):
     with pytest.raises(InputError, match=re.escape(message)):
         make_strategy(settings(**changes), 5)
-
-
-def test_strategy_params_arrive():
-    strategy = make_strategy(settings(strategy_params={"std_min": 0.25, "c_mean": 0.5}), 5)
-    assert (float(strategy.params.std_min), float(strategy.params.c_mean)) == (0.25, 0.5)
-    assert float(strategy.params.std_init) == 0.5
-    de = make_strategy(settings(strategy="DE", strategy_params={"elitism": False}), 5)
-    assert de.params.elitism is False
-
-
-# --- the loop ---
 
 
 def test_same_seed_same_bits():
@@ -222,25 +171,6 @@ def test_arrays_of_another_search_are_refused():
             GeneEvolution(other, Executor(Quadratic(genes))).from_arrays(arrays)
 
 
-def test_rows_hold_the_figures():
-    fitness = Quadratic()
-    config = settings(generations=1)
-    _, (row,) = finish(config, fitness)
-    assert list(row)[:6] == ["generation", "evaluations", "best", "mean", "std", "median"]
-    assert (row["generation"], row["evaluations"], row["failed"], row["restarts"]) == (1, 16, 0, 0)
-    assert row["mean"] < row["best"] == row["champion"]
-    assert row["distance_m"] == pytest.approx(np.sqrt(-row["best"]), rel=1e-6)
-    assert row["step_size"] == pytest.approx(config.std_init, rel=0.3)
-
-
-def test_failures_do_not_spread():
-    config = settings(generations=40)
-    search, rows = finish(config, Broken(lambda rows: rows % 4 == 0))
-    assert all(row["failed"] == 4 for row in rows)
-    assert all(np.isfinite(row["mean"]) for row in rows)
-    assert search.elite_scores[0] > -0.05
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_search_where_everything_fails_goes_on(value):
     search, rows = finish(settings(), Broken(lambda rows: rows >= 0, value))
@@ -248,24 +178,6 @@ def test_a_search_where_everything_fails_goes_on(value):
     assert search.elite_scores.tolist() == [-np.inf] * 4
     assert np.isfinite(search.state["algorithm"].mean).all()
     assert rows[-1]["step_size"] > 0.05
-
-
-def test_a_fitness_may_name_its_worst_score():
-    fitness = Broken(lambda rows: rows == 2, -1000.0)
-    fitness.worst_score = -1000.0
-    _, rows = finish(settings(generations=2), fitness)
-    assert all(row["failed"] == 1 and row["mean"] > -50 for row in rows)
-
-
-def test_ties_do_not_shrink_the_step():
-    # evosax alone: 0.5 to 8e-8 in 60 generations.
-    class Flat(Quadratic):
-        def evaluate(self, population, key):
-            return jnp.zeros(len(population)), {}
-
-    _, rows = finish(settings(generations=60), Flat())
-    assert min(row["step_size"] for row in rows) > 0.1
-    assert rows[-1]["restarts"] == 0
 
 
 def test_a_stalled_search_starts_anew_and_keeps_its_champion():
@@ -289,15 +201,6 @@ def test_a_broken_state_starts_anew():
     search, rows = finish(settings(generations=5), fitness, search)
     assert [row["restarts"] for row in rows] == [1, 1]
     assert np.isfinite(search.state["algorithm"].mean).all()
-
-
-def test_a_fitness_of_the_wrong_shape():
-    class Wrong(Quadratic):
-        def evaluate(self, population, key):
-            return jnp.zeros(3), {}
-
-    with pytest.raises(ValueError, match="expected 16 scores; found shape"):
-        finish(settings(), Wrong())
 
 
 def test_the_champion_is_judged_on_fresh_keys():
@@ -328,7 +231,6 @@ def test_the_champion_is_judged_on_fresh_keys():
 
 
 def test_doing_nothing_is_a_candidate():
-    """Where all that has evolved is worse than zero genes on fresh starts, they are champion."""
 
     class Still(Quadratic):
         def evaluate(self, population, key):
@@ -343,12 +245,3 @@ def test_doing_nothing_is_a_candidate():
     # Of equal ones, what has evolved wins.
     champion = choose_champion(config, Broken(lambda rows: rows >= 0, 1.0), search)
     assert champion.origin.startswith("best of generation")
-
-
-def test_candidates_that_fail_do_not_win():
-    config = settings(generations=5)
-    search, _ = finish(config, Quadratic())
-    champion = choose_champion(config, Broken(lambda rows: rows != 2), search)
-    assert champion.origin == f"best of generation {search.elite_generations[2]}"
-    failed = choose_champion(config, Broken(lambda rows: rows >= 0), search)
-    assert failed.score == FAILED_SCORE

@@ -1,7 +1,5 @@
 """Signals sent to real processes: what was finished is saved, and no run is begun by accident."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -71,7 +69,6 @@ sys.exit(run_command(lambda argv: 0))
 
 
 def test_ctrl_c_while_the_process_ends_is_no_traceback(tmp_path):
-    """As where JAX clears its caches."""
     (tmp_path / "mjx-revolve").write_text(ENDING)
     process = subprocess.Popen(
         [sys.executable, str(tmp_path / "mjx-revolve")], text=True, stdout=subprocess.PIPE,

@@ -8,8 +8,6 @@ import pytest
 
 from mjx_revolve.evolution import progress
 
-# --- what it says while it goes on ---
-
 
 class Terminal(io.StringIO):
     """A terminal; `drawn` is what stood on it, one after the other."""
@@ -56,15 +54,6 @@ def test_a_log_has_sixty_lines_at_most(total, stride, clock):
     assert told == sorted({0, 1, total, *middle})
 
 
-def test_a_log_is_never_silent_for_long(clock):
-    out = io.StringIO()
-    shown = progress.Progress(0, 500, out)
-    for generation in range(1, 6):
-        shown.show(row(generation))
-        clock[0] += 31.0
-    assert len(out.getvalue().splitlines()) == 6
-
-
 def test_plain_lines_tell_the_time_left(clock):
     out = io.StringIO()
     shown = progress.Progress(4, 10, out)
@@ -79,15 +68,6 @@ def test_plain_lines_tell_the_time_left(clock):
         "generation 6/10  best 0.25  mean 0.3333  failed 3  evaluations/s 1234  left 01:00",
         "drawing",
     ]
-
-
-def test_a_colonys_line_tells_of_intervals(clock):
-    out = io.StringIO()
-    shown = progress.Progress(0, 6, out, "interval")
-    shown.show(row(1, living=14, time=10.0, times_real_time=35.2))
-    assert out.getvalue().splitlines()[1] == (
-        "interval 1/6  alive 14  time 10 s  best 0.25  mean 0.3333  times real time 35.2  left ?"
-    )
 
 
 LINES = {  # columns: what stands there, bar aside; nothing is cut in the middle
@@ -119,19 +99,6 @@ def test_the_live_line_fits_its_terminal(columns, clock, monkeypatch):
     assert re.split("  +", found) == LINES[size.columns]
 
 
-def test_the_live_line_is_not_drawn_too_often(clock, monkeypatch):
-    monkeypatch.setattr(progress.Progress, "_columns", lambda self: 120)
-    out = Terminal("ascii")
-    shown = progress.Progress(0, 1000, out)
-    for generation in range(1, 101):
-        clock[0] += 0.01
-        shown.show(row(generation))
-    assert len(out.drawn) < 15
-    shown.close()  # interrupted: the last generation is there
-    assert out.drawn[-1].startswith("generation 100/1000  ###")
-    out.getvalue().encode("ascii")
-
-
 def test_dumb_terminals_get_plain_lines(clock, monkeypatch):
     monkeypatch.setenv("TERM", "dumb")
     out = Terminal()
@@ -140,14 +107,3 @@ def test_dumb_terminals_get_plain_lines(clock, monkeypatch):
         "generation 0/4  compiling\n"
         "generation 1/4  best 0.25  mean 0.3333  evaluations/s 1234  left ?\n"
     )
-
-
-def test_nobody_listening_is_no_reason_to_end(clock):
-    """A real pipe without a reader."""
-    reader, writer = os.pipe()
-    os.close(reader)
-    out = io.TextIOWrapper(io.FileIO(writer, "w"), write_through=True)
-    shown = progress.Progress(0, 3, out)
-    for generation in range(1, 4):
-        shown.show(row(generation))
-    shown.close()

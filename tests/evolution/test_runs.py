@@ -6,8 +6,6 @@ import io
 import json
 import os
 import shutil
-import time
-import zlib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,10 +24,6 @@ from mjx_revolve.evolution.fingerprints import settings_hash
 from mjx_revolve.evolution.run import _prepare, check_unchanged
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.yaml_reader import load_yaml
-from mjx_revolve.numerics import runtime
-from mjx_revolve.view.convergence import plot_fitness
-from mjx_revolve.view.motion_plots import plot_trajectory
-from mjx_revolve.view.plots import figure_png
 from mjx_revolve.water.world import load_world
 
 ARRAYS = {
@@ -59,21 +53,8 @@ def save(run, generation, keep=3):
     return run.save_checkpoint(generation, ARRAYS, {"note": "x"}, keep)
 
 
-# --- the folder ---
-
-
-def test_new_folder(tmp_path, config):
-    run, own = runs.create_run_folder(tmp_path / "a" / "run", config, seed=3, model_hash="ab")
-    assert own.morphology == str(tmp_path / "a" / "run" / "inputs" / "robot.yaml")
-    copies = run.info.pop("inputs")
-    assert run.info == {"seed": 3, "model_hash": "ab", "inputs": copies}
-    assert list(copies) == ["inputs/robot.yaml"]
-    run.close()
-
-
 @pytest.mark.parametrize("elsewhere", [False, True], ids=["beside", "elsewhere"])
 def test_a_run_folder_is_whole(tmp_path, monkeypatch, elsewhere):
-    """All that a configuration names is copied; the folder moves, and the originals may go."""
     monkeypatch.chdir(tmp_path)
     mine = tmp_path / "mine"
     for name in ("mine/fields", "mine/twin", "sea"):
@@ -134,7 +115,6 @@ def test_a_world_mapping_keeps_its_field(tmp_path, config):
 
 
 def test_older_run_folders_open(tmp_path, config):
-    """They name a world of the user's by its absolute path, and have no hashes of copies."""
     (tmp_path / "sea.yaml").write_text("density: 1030.0\n")
     run, _ = runs.create_run_folder(tmp_path / "run", config)
     run.save_config(override_config(run.load_config(), {"world": str(tmp_path / "sea.yaml")}))
@@ -145,7 +125,6 @@ def test_older_run_folders_open(tmp_path, config):
 
 
 def test_older_runs_keep_the_core_and_the_length_at_rest(tmp_path, config):
-    """Their config.yaml has no such settings, and their fingerprints lack them."""
     older = override_config(config, {"task.point": "core", "task.length": "rest"})
     run, _ = runs.create_run_folder(tmp_path / "run", older)
     text = (run.path / "config.yaml").read_text()
@@ -161,7 +140,6 @@ def test_older_runs_keep_the_core_and_the_length_at_rest(tmp_path, config):
 
 
 def test_older_runs_keep_the_drag_of_faces(tmp_path, config):
-    """Their config.yaml states no drag law; that of a new run does, whatever its world's file."""
     pond = tmp_path / "pond.yaml"
     pond.write_text("drag: ellipsoid\n")
     for name, change, stated, law in (
@@ -202,7 +180,6 @@ def test_full_folder_is_refused(tmp_path, config):
 
 
 def test_a_folder_whose_making_was_cut_short_is_a_new_one(tmp_path, run, config):
-    """As kill -9 leaves it, at the last moment."""
     run.close()
     os.rename(run.path / "config.yaml", run.path / ".123-config.yaml")
     with pytest.raises(InputError, match="found one that was not begun; begin it with --out"):
@@ -211,40 +188,11 @@ def test_a_folder_whose_making_was_cut_short_is_a_new_one(tmp_path, run, config)
     again.close()
 
 
-def test_a_folder_that_was_removed_is_not_made_anew_in_parts(run):
-    shutil.rmtree(run.path)
-    for write in (lambda: run.save_checkpoint(1, ARRAYS, {}, 3), lambda: run.update_info(a=1)):
-        with pytest.raises(OSError, match="the run folder was removed"):
-            write()
-    assert not run.path.exists()
-
-
-def test_only_run_folders_open(tmp_path):
-    with pytest.raises(InputError, match="nowhere: expected a run folder; found none"):
-        runs.open_run_folder(tmp_path / "nowhere")
-    with pytest.raises(InputError, match=r"expected a run folder; found no config.yaml in it"):
-        runs.open_run_folder(tmp_path)
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="expected a run folder; found a file"):
-        runs.open_run_folder(tmp_path / "file")
-
-
 def test_one_process_at_a_time(run):
     with pytest.raises(InputError, match="expected a run that has stopped; found it running"):
         runs.open_run_folder(run.path)
     run.close()
     runs.open_run_folder(run.path).close()
-
-
-def test_info_is_json(run):
-    run.update_info(seed=None, inputs=None, finished="now")
-    assert json.loads((run.path / "run.json").read_text()) == {"finished": "now"}
-    (run.path / "run.json").write_text("{")
-    with pytest.raises(InputError, match=r"run.json: expected JSON; found"):
-        _ = run.info
-
-
-# --- files ---
 
 
 def test_a_failed_write_leaves_the_old_file(run):
@@ -261,9 +209,6 @@ def test_a_failed_write_leaves_the_old_file(run):
     assert not list(run.path.glob(".*note.txt"))
 
 
-# --- metrics ---
-
-
 def test_metrics_are_rfc_4180_at_any_time(run):
     for generation in (1, 2):
         run.append_metrics({"generation": generation, "best, so far": np.float32(0.1) * generation})
@@ -277,7 +222,6 @@ def test_metrics_are_rfc_4180_at_any_time(run):
 
 
 def test_metrics_keep_the_columns_that_a_run_began_with(run):
-    """An older version's run, resumed by one that measures more, less, and in another order."""
     run.append_metrics({"generation": 1, "best": 2.0, "old": 3.0})
     run.append_metrics({"new": 4.0, "best": 5.0, "generation": 2})
     read = run.load_metrics()
@@ -285,24 +229,11 @@ def test_metrics_keep_the_columns_that_a_run_began_with(run):
     assert read["best"].tolist() == [2, 5] and np.isnan(read["old"][1])
 
 
-def test_pandas_reads_metrics(run):
-    pandas = pytest.importorskip("pandas")
-    run.append_metrics({"generation": 1, "best": float("nan")})
-    run.append_metrics({"generation": 2, "best": -1e-12})
-    frame = pandas.read_csv(run.metrics_path)
-    assert frame["generation"].tolist() == [1, 2]
-    assert np.isnan(frame["best"][0])
-    assert frame["best"][1] == -1e-12
-
-
 @pytest.mark.parametrize("text", ["generation,b\r\n1,x\r\n", "generation,b\r\n1\r\n"])
 def test_broken_metrics(tmp_path, text):
     (tmp_path / "metrics.csv").write_text(text)
     with pytest.raises(InputError, match=r"metrics.csv: expected a number in every cell"):
         runs.RunFolder(tmp_path).load_metrics()
-
-
-# --- checkpoints ---
 
 
 def test_checkpoint_keeps_every_bit_and_dtype(run):
@@ -334,12 +265,10 @@ def flip(data, at):
     [
         lambda data: b"",
         lambda data: data[: len(data) // 2],
-        lambda data: data[:-1],
-        lambda data: b"\0" * len(data),
         lambda data: flip(data, data.index(ARRAYS["state['algorithm'].mean"].tobytes()) + 5),
         lambda data: flip(data, 200),
     ],
-    ids=["empty", "half", "one byte short", "zeros", "bit in an array", "bit in the meta"],
+    ids=["empty", "half", "bit in an array", "bit in the meta"],
 )
 def test_a_damaged_checkpoint_is_passed_over(run, damage):
     save(run, 1)
@@ -349,17 +278,6 @@ def test_a_damaged_checkpoint_is_passed_over(run, damage):
     assert checkpoint.meta["generation"] == 1
     assert len(checkpoint.damaged) == 1
     assert checkpoint.damaged[0].startswith("generation_000002.npz (")
-
-
-def test_a_checkpoint_that_lacks_an_array_is_passed_over(run):
-    """As where one bit of the zip's directory is flipped, by which an entry vanishes."""
-    save(run, 1)
-    path = save(run, 2)
-    with np.load(path) as file:
-        np.savez(path, **{name: file[name] for name in file.files if "counter" not in name})
-    checkpoint = run.load_checkpoint()
-    assert checkpoint.meta["generation"] == 1
-    assert "expected an array 'counter'; found none" in checkpoint.damaged[0]
 
 
 def test_pickles_are_not_read(run):
@@ -414,8 +332,11 @@ def test_a_checkpoint_ahead_of_its_logs_is_passed_over(run):
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("positions", {"../../thesis.tex": 0}), ("positions", {"/etc/passwd": 0}), ("positions", [1]),
-     ("positions", {runs.LOGS[0]: "0"}), ("generation", -1), ("metrics_position", True)],
+    [
+("positions", {"../../thesis.tex": 0}),
+("positions", [1]),
+("generation", -1)
+],
 )  # fmt: skip
 def test_a_checkpoint_cuts_no_other_files(run, key, value):
     path = save(run, 1)
@@ -427,13 +348,7 @@ def test_a_checkpoint_cuts_no_other_files(run, key, value):
         run.load_checkpoint()
 
 
-def test_a_pipe_among_the_checkpoints_keeps_nobody_waiting(run):
-    save(run, 1)
-    os.mkfifo(run.path / "checkpoints" / "generation_000002.npz")
-    assert run.load_checkpoint().meta["generation"] == 1
-
-
-@pytest.mark.parametrize("name", ["metrics.csv", "individuals.jsonl", ".lock", "checkpoints"])
+@pytest.mark.parametrize("name", ["metrics.csv", "checkpoints"])
 @pytest.mark.parametrize("what", ["link", "pipe"])
 def test_a_run_writes_no_files_elsewhere_and_waits_for_none(run, tmp_path, name, what):
     run.save_config(load_config("smoke"))
@@ -446,9 +361,6 @@ def test_a_run_writes_no_files_elsewhere_and_waits_for_none(run, tmp_path, name,
     found = "a link that leads out" if what == "link" else "something else"
     with pytest.raises(InputError, match=rf"{name}: expected a .+; found {found}$"):
         runs.open_run_folder(run.path)
-
-
-# --- champion ---
 
 
 def test_champion_genes_come_back_bit_for_bit(run):
@@ -467,33 +379,8 @@ def test_champion_genes_come_back_bit_for_bit(run):
             load_genes(run.path)
 
 
-# --- the compilation cache ---
-
-
-def test_half_written_cache_entries_are_removed_once(tmp_path):
-    whole = zlib.compress(os.urandom(1000))
-    entries = {"whole-cache": whole, "empty-cache": b"", "half-cache": whole[:500], "other": b""}
-    for name, data in entries.items():
-        (tmp_path / name).write_bytes(data)
-    assert runtime.remove_broken_entries(tmp_path) == ["empty-cache", "half-cache"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".checked", "other", "whole-cache"]
-    assert runtime.remove_broken_entries(tmp_path) == []
-    (tmp_path / "late-cache").write_bytes(whole[:500])
-    assert runtime.remove_broken_entries(tmp_path) == ["late-cache"]
-
-
-def test_a_clock_that_went_backwards_hides_no_broken_entry(tmp_path):
-    (tmp_path / "old-cache").write_bytes(zlib.compress(b"x"))
-    later = time.time() + 3600  # what was written before somebody set the clock back
-    os.utime(tmp_path / "old-cache", (later, later))
-    assert runtime.remove_broken_entries(tmp_path) == []
-    (tmp_path / "new-cache").write_bytes(b"half")
-    assert runtime.remove_broken_entries(tmp_path) == ["new-cache"]
-
-
 @pytest.mark.filterwarnings("ignore:Error reading persistent compilation cache")
 def test_a_damaged_cache_entry_costs_only_time(tmp_path):
-    """Damaged behind our back, after entries were looked through."""
     before = {
         name: getattr(jax.config, name)
         for name in ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs",
@@ -513,44 +400,3 @@ def test_a_damaged_cache_entry_costs_only_time(tmp_path):
         for name, value in before.items():
             jax.config.update(name, value)
         compilation_cache.reset_cache()
-
-
-# --- pictures ---
-
-
-def swim(depth, steps=200):
-    time = np.arange(steps) * 0.05
-    path = np.stack([0.1 * time, 0.05 * np.sin(time), -depth + 0 * time], axis=-1)
-    return SimpleNamespace(time=time, xpos=np.stack([0 * path, path], axis=1))
-
-
-@pytest.mark.parametrize("generations", [1, 2, 40])
-def test_fitness_plot(generations):
-    column = np.linspace(0.1, 0.2, generations)
-    names = ("best", "mean", "std", "champion", "step_size", "energy_j", "speed_bl_s")
-    metrics = {"generation": np.arange(generations) + 1.0} | dict.fromkeys(names, column)
-    if generations > 2:
-        metrics["mean"] = np.where(np.arange(generations) == 3, np.nan, column)
-    figure = plot_fitness(metrics, "title", "fitness (m/s)")
-    labels = [axes.get_ylabel() for axes in figure.axes]
-    assert labels[0] == "fitness (m/s)"
-    assert labels[1].startswith("speed over ground\n(body lengths/s)")
-    assert figure.axes[0].get_xlabel() == "generation"
-    assert figure_png(figure).startswith(b"\x89PNG")
-
-
-def test_trajectory_plot():
-    figure = plot_trajectory(swim(depth=2.0), surface_height=0.0)
-    above, depth, speed, _ = figure.axes
-    assert (above.get_xlabel(), above.get_ylabel()) == ("x (m)", "y (m)")
-    assert above.get_aspect() == 1.0
-    assert np.allclose(depth.lines[0].get_ydata(), 2.0)
-    # Over one second the wiggle and the edges hardly count: 0.1 m/s along x, up to 0.05 along y.
-    smooth = speed.lines[1].get_ydata()
-    assert smooth.min() >= 0.1 and smooth.max() < np.hypot(0.1, 0.05) + 1e-6
-    assert figure_png(figure).startswith(b"\x89PNG")
-
-
-def test_trajectory_plot_of_almost_nothing():
-    figure = plot_trajectory(swim(depth=0.0, steps=2))
-    assert figure_png(figure).startswith(b"\x89PNG")

@@ -1,23 +1,18 @@
 """Parents and survivors, worked by hand on small populations."""
 
-from typing import get_args
-
 import numpy as np
 import pytest
 
-from mjx_revolve.episodes import bodies_config
 from mjx_revolve.episodes.bodies_config import SelectionConfig
-from mjx_revolve.evolution.novelty import axis_scale, novelty
+from mjx_revolve.evolution.novelty import novelty
 from mjx_revolve.evolution.selection import (
     SCHEMES,
     Candidates,
     best_first,
-    check_selection,
     crowding_distance,
     dominates,
     nondominated_sort,
 )
-from mjx_revolve.inputs.errors import InputError
 
 NAN, INF = np.nan, np.inf
 
@@ -45,12 +40,6 @@ def parents(scheme, found, count, seed=0, **settings):
     return SCHEMES[scheme].parents(np.random.default_rng(seed), found, config, count)
 
 
-def test_schemes_are_those_that_a_configuration_may_name():
-    assert tuple(SCHEMES) == get_args(bodies_config.Scheme)
-
-
-# --- order
-
 # Speed and thrift. A, B and C trade one for the other; D is worse than B in both, E equals B in
 # thrift and is slower, F is worse than D, and G has failed.
 A, B, C, D, E, F, G = (0, 9), (4, 5), (8, 0), (3, 4), (2, 5), (3, 3), (7, NAN)
@@ -65,14 +54,6 @@ def test_dominance():
     # Failed: below everything, even where one value is the best of all.
     assert dominates(FIELD[5], FIELD[6]) and not dominates(FIELD[6], FIELD[5])
     assert not dominates(FIELD[6], FIELD[6])
-
-
-def test_fronts():
-    # D and E trade: 3 > 2 but 4 < 5. F is dominated by D only after B.
-    assert nondominated_sort(FIELD).tolist() == [0, 0, 0, 1, 1, 2, 3]
-    assert nondominated_sort(np.full((3, 2), 7.0)).tolist() == [0, 0, 0]
-    assert nondominated_sort(np.full((2, 3), NAN)).tolist() == [0, 0]
-    assert nondominated_sort(np.array([[1.0], [3.0], [2.0]])).tolist() == [2, 0, 1]
 
 
 def test_each_front_is_what_none_of_the_rest_dominates():
@@ -97,14 +78,6 @@ def test_crowding():
     assert crowding_distance(flat, np.zeros(4, int)) == pytest.approx([INF, 0.3, 0.9, INF])
 
 
-def test_order_of_scores():
-    assert best_first(np.array([[1.0], [NAN], [3.0], [INF], [3.0]]), np.arange(5)).tolist() == [
-        2, 4, 0, 1, 3,
-    ]  # fmt: skip
-    # Ties go to the lower id, wherever it stands.
-    assert best_first(np.ones((3, 1)), np.array([7, 3, 5])).tolist() == [1, 2, 0]
-
-
 def test_order_of_several_objectives():
     # Front 0: the ends by age, then B; front 1: D and E, both ends; F; G, which failed.
     assert best_first(FIELD, np.arange(7)).tolist() == [0, 2, 1, 3, 4, 5, 6]
@@ -121,9 +94,6 @@ def test_order_does_not_depend_on_where_individuals_stand(objectives):
     for _ in range(5):
         shuffled = rng.permutation(40)
         assert (ids[shuffled][best_first(values[shuffled], ids[shuffled])] == expected).all()
-
-
-# --- survivors
 
 
 def test_plus_keeps_the_best_of_all():
@@ -204,9 +174,6 @@ def test_the_old_go_however_good_they_are():
     assert survivors("plus", youngest, 3, generation=50, max_age=2) == [1, 2]
 
 
-# --- parents
-
-
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_parents_are_two_and_drawn_by_the_generator_alone(scheme):
     found = candidates([5, 1, NAN, 7, 2])
@@ -236,31 +203,6 @@ def test_tournaments_win_as_often_as_they_must():
     assert np.bincount(pairs[:, 0], minlength=3)[1] == 0
 
 
-@pytest.mark.parametrize("scheme", ["map_elites", "random"])
-def test_parents_are_drawn_uniformly_without_tournaments(scheme):
-    pairs = parents(scheme, candidates([1, 9, NAN, 5]), 20_000, tournament=4)
-    for column in pairs.T:
-        assert np.bincount(column, minlength=4) / 20_000 == pytest.approx([0.25] * 4, abs=0.015)
-
-
-# --- settings
-
-
-def test_too_few_children_are_refused():
-    check_selection(SelectionConfig(type="comma"), 8)
-    check_selection(SelectionConfig(type="generational", elites=2, offspring=6), 8)
-    check_selection(SelectionConfig(type="plus", offspring=1, elites=9), 8)
-    with pytest.raises(InputError, match=r"offspring: expected at least .*\(8\), .*; found 7$"):
-        check_selection(SelectionConfig(type="comma", offspring=7), 8)
-    with pytest.raises(InputError, match=r"at least .*\(8\) - elites \(2\), .*; found 5$"):
-        check_selection(SelectionConfig(type="generational", elites=2, offspring=5), 8)
-    with pytest.raises(InputError, match=r"elites: expected less than .*\(8\); found 8$"):
-        check_selection(SelectionConfig(type="generational", elites=8), 8)
-
-
-# --- novelty
-
-
 def test_novelty_is_the_mean_distance_to_the_nearest():
     points = np.array([[0, 0], [3, 4], [0, 1]], float)
     others = np.array([[0, -2], [30, 40]], float)
@@ -273,18 +215,3 @@ def test_novelty_is_the_mean_distance_to_the_nearest():
     assert novelty(points[:1], others[:0], 3, np.ones(2)).tolist() == [0.0]
     # An equal point is a neighbour; the point itself is none.
     assert novelty(points[[0, 0]], others[:0], 1, np.ones(2)).tolist() == [0.0, 0.0]
-
-
-def test_points_that_are_not_finite_are_no_neighbours():
-    points = np.array([[0, 0], [NAN, 0], [0, 1], [INF, 3]], float)
-    others = np.array([[NAN, NAN], [0, 5]], float)
-    assert novelty(points, others, 2, np.ones(2)).tolist() == [3.0, 0.0, 2.5, 0.0]
-    assert novelty(points[[1, 3]], others, 2, np.ones(2)).tolist() == [0.0, 0.0]
-
-
-def test_axis_scale():
-    points = np.array([[1, 0.1, 5], [3, 0.1, 5], [NAN, 0, 0]])
-    assert axis_scale(points).tolist() == [1.0, 1.0, 1.0]
-    assert axis_scale(np.array([[0.0], [6.0]])).tolist() == [3.0]
-    assert axis_scale(np.full((50, 1), 0.1)).tolist() == [1.0]
-    assert axis_scale(points[2:]).tolist() == [1.0, 1.0, 1.0]

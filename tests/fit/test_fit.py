@@ -12,8 +12,6 @@ from scipy.spatial.transform import Rotation
 from experiments.fit_coverage import commands
 from experiments.fit_measured import GLIDE, fit_glide, fit_lamprey, glide_errors, lamprey_ratios
 from mjx_revolve import fit as command
-from mjx_revolve.body.catalogue import MODULES
-from mjx_revolve.body.coefficients import correct_types, load_coefficients
 from mjx_revolve.body.morphology import load_morphology, make_morphology, save_morphology
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.variants import course_targets
@@ -240,9 +238,6 @@ def test_a_plan_knows_more_with_each_motion(auv):
     assert not plan.unknown
 
 
-# --- coefficients in files ------------------------------------------------------------------------
-
-
 def test_morphologies_and_configurations_name_what_was_fitted(fitted, tmp_path):
     (tmp_path / "water.yaml").write_text(fitted.to_yaml())
     tree = {"id": "core", "type": "Core", "children": {1: {"id": "leg", "type": "ActiveHinge"}}}
@@ -263,35 +258,6 @@ def test_morphologies_and_configurations_name_what_was_fitted(fitted, tmp_path):
     np.testing.assert_allclose(
         mine.carried_mass, fitted.values[1].value * plain.carried_mass, rtol=1e-6
     )
-
-
-def test_factors_of_one_coefficient_and_of_one_module():
-    robot = build_robot(load_morphology("spider"), load_world("lake"))
-    free = read_free(["drag_coefficient.x@Core", "servo_speed@left_hip", "mass"], robot)
-    found = with_values(robot, free, np.log([2.0, 0.5, 1.1])).morphology
-    core, hip = found.modules[0], next(m for m in found.modules if m.name == "left_hip")
-    assert dict(core.kind.parts[0].factors)["drag_coefficient"] == (2.0, 1.0, 1.0)
-    assert hip.kind.hinge.speed == pytest.approx(MODULES["ActiveHinge"].hinge.speed / 2)
-    assert found.mass == pytest.approx(1.1 * robot.morphology.mass)
-    with pytest.raises(InputError, match=r"water.yaml: modules.left_hip: expected `all` or a type"):
-        correct_types(MODULES, {"left_hip": {}}, "water.yaml")
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("modules: {all: {factors: {dragg: 2}}}", "modules.all.factors: expected names of coeff"),
-        ("drag: 2", "expected a mapping `modules`"),
-        ("modules: {all: 3}", "modules.all: expected a mapping"),
-    ],
-)
-def test_a_wrong_file_of_coefficients_is_one_line(tmp_path, text, words):
-    (tmp_path / "water.yaml").write_text(text)
-    with pytest.raises(InputError, match=words.replace(".", r"\.")):
-        load_coefficients(tmp_path / "water.yaml")
-
-
-# --- recordings -----------------------------------------------------------------------------------
 
 
 def write_csv(path, columns):
@@ -318,23 +284,14 @@ def backwards():
 
 
 BAD = {
-    "empty": ("", "found an empty file"),
-    "words": ("time,x,y\n0,1,2\n1,oops,2\n", "row 3, column x: expected a number; found 'oops'"),
-    "nothing measured": (changed(x=np.full(60, np.nan)), "column x: expected numbers; found none"),
-    "no time": (changed(time=None), "expected a column time"),
-    "back": (changed(time=backwards()), "row 32: expected a time later than 1.45 s; found 1.4 s"),
-    "millimetres": (changed(x=200 * np.arange(60.0)), "millimetres or pixels"),
-    "other robot": (changed(**{"command.left_hip": np.zeros(60)}), "another robot"),
-    "percent": (changed(**{"command.port": np.full(60, 40.0)}), "percent"),
-    "still": (changed(x=np.ones(60), y=np.ones(60), yaw=np.zeros(60)), "a robot that moves"),
-    "no place": (changed(x=None, y=None), "expected x and y of the core, marks, or mean_speed"),
-    "ragged": ("time,x\n0,1\n1,2,3\n2,3\n", "row 3: expected 2 cells; found 3"),
-    "semicolons": ("time;x;y\n0;1;2\n1;2;2\n", "commas between them; found semicolons"),
-    "twice": ("time,x,x\n0,1,2\n1,2,2\n", "column x: expected each name once; found it twice"),
-    "degrees": (changed(yaw=25 * np.arange(60.0)), "yaw: expected radians; found steps of 500 a"),
-    "milliseconds": (changed(time=50 * np.arange(60.0)), "found 50 s: milliseconds?"),
-    "no quaternion": (changed(qw=np.full(60, 7.0), qx=np.zeros(60), qy=np.zeros(60),
-                              qz=np.zeros(60)), "expected unit quaternions"),
+"words": ("time,x,y\n0,1,2\n1,oops,2\n", "row 3, column x: expected a number; found 'oops'"),
+"back": (changed(time=backwards()), "row 32: expected a time later than 1.45 s; found 1.4 s"),
+"millimetres": (changed(x=200 * np.arange(60.0)), "millimetres or pixels"),
+"other robot": (changed(**{"command.left_hip": np.zeros(60)}), "another robot"),
+"still": (changed(x=np.ones(60), y=np.ones(60), yaw=np.zeros(60)), "a robot that moves"),
+"no place": (changed(x=None, y=None), "expected x and y of the core, marks, or mean_speed"),
+"semicolons": ("time;x;y\n0;1;2\n1;2;2\n", "commas between them; found semicolons"),
+"degrees": (changed(yaw=25 * np.arange(60.0)), "yaw: expected radians; found steps of 500 a")
 }  # fmt: skip
 
 
@@ -347,24 +304,6 @@ def test_a_bad_recording_is_one_line(kind, tmp_path, capsys):
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and words in error and "swim" in error
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["auv"], "expected a RECORDING, or --plan"),
-        (["auv", "none.csv"], "expected a CSV, an MCAP, a ROS 2 bag or a run folder; found none"),
-        (["--plan", "auv", "--free", "lift"], "--free lift: expected some of drag, added_mass"),
-        (["--plan", "spider", "--free", "thrust"], "expected a robot with a thruster; found none"),
-        (["--plan", "auv", "--free", "drag@leg"], "--free drag@leg: expected @ and one of Core"),
-        (["--plan", "auv", "--set", "windows=3"], "settings.windows: expected one of window"),
-        (["--plan", "auv", "--free", "drag,drag"], "--free drag: expected each name once"),
-    ],
-)
-def test_wrong_arguments_are_one_line(arguments, words, capsys):
-    assert run_command(command.main, arguments) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and words in error
 
 
 MARKS = {"a": (0.0, 0.1, 0.0), "b": (0.0, -0.1, 0.0), "c": (0.05, 0.03, 0.0)}
@@ -398,16 +337,6 @@ def test_marks_that_are_not_on_the_robot_are_refused(auv, tmp_path, columns, wor
         make_problem(auv, [recording], ["drag"], FitSettings())
 
 
-def test_marks_as_they_should_be_begin_where_the_robot_is(auv, tmp_path):
-    write_csv(tmp_path / "swim.csv", marks())
-    where = [f"mark.{k}=core:{','.join(map(str, v))}" for k, v in MARKS.items()]
-    recording = load_recording(tmp_path / "swim.csv", auv, read_map(where))
-    problem = make_problem(auv, [recording], ["drag"], FitSettings(window=1.0, held_out=0.0))
-    np.testing.assert_allclose(problem.roots[4, :2, 0], [0.2, 0.0], atol=2e-3)
-    np.testing.assert_allclose(problem.roots[4, 7:9, 0], [0.2, 0.0], atol=5e-3)
-    np.testing.assert_allclose(problem.roots[4, 12, 0], 0.3, atol=5e-3)
-
-
 def test_units_gaps_and_factors_of_columns(auv, tmp_path):
     columns = swim()
     columns = {"frame": 20 * columns["time"], "px": 500 * columns["x"], "y_mm": 1e3 * columns["y"],
@@ -424,20 +353,6 @@ def test_units_gaps_and_factors_of_columns(auv, tmp_path):
     )
 
 
-def test_a_bag_of_ours_is_read(auv, tmp_path):
-    pytest.importorskip("rosbags", reason="the package rosbags reads bags")
-    from mjx_revolve.formats.ros_bag import write_bag
-
-    trajectory = simulate(auv, [0.5] * 4, 1.0, once=True)
-    write_bag(auv, trajectory, tmp_path / "swim.mcap")
-    found = load_recording(tmp_path / "swim.mcap", auv, {})
-    assert {"x", "qw", "command.port"} <= set(found.signals)
-    rows = np.round((found.signals["x"].time + 0.01) / auv.world.timestep).astype(int) - 1
-    np.testing.assert_allclose(
-        found.signals["y"].value, np.asarray(trajectory.qpos)[rows, 1], atol=1e-6
-    )
-
-
 def test_prescribed_hinges_follow_what_was_measured():
     robot = build_robot(load_morphology("spider"), load_world("lake", bed="off"))
     time = np.arange(0, 2, 0.02)
@@ -451,9 +366,6 @@ def test_prescribed_hinges_follow_what_was_measured():
     np.testing.assert_allclose(angle, hip, atol=2e-3)
     course = np.cumsum(np.random.default_rng(0).normal(size=20))
     assert course_targets(course, 0.01).shape == (18,)
-
-
-# --- runs -----------------------------------------------------------------------------------------
 
 
 class Stop(Interrupts):
@@ -501,18 +413,6 @@ def test_a_fit_that_was_stopped_goes_on_bit_for_bit(signals, tmp_path):
     assert json.loads((tmp_path / "whole" / "fit.json").read_text())["values"][0]["found"]
     corrected = load_morphology(tmp_path / "whole" / "robot.yaml")
     assert dict(corrected.modules[0].kind.parts[0].factors)["drag"] == found.values[0].value
-
-
-def test_the_page_shows_what_was_found(fitted):
-    from mjx_revolve.view.report.fit import make_fit_page
-
-    page = make_fit_page(fitted)
-    for words in ("Predicted beside recorded", "held out", "added_mass", "3 of 3", "<img"):
-        assert words in page
-    assert "http" not in page.replace("http://www.w3.org", "")
-
-
-# --- measured -------------------------------------------------------------------------------------
 
 
 @pytest.mark.long

@@ -167,8 +167,7 @@ def commands_of(auv):
     return [f"--map=command.{name}=/thrusters/{name}*0.01" for name in names]
 
 
-@pytest.mark.parametrize(("plugin", "bare"), [("MCAP", False), ("MCAP", True), ("SQLITE3", False),
-                                              ("SQLITE3", True)])  # fmt: skip
+@pytest.mark.parametrize(("plugin", "bare"), [("MCAP", True), ("SQLITE3", False)])
 def test_a_bag_of_either_kind_as_a_folder_and_as_a_file(
     fit, auv, signals, tmp_path, plugin, bare
 ):  # fmt: skip

@@ -1,24 +1,18 @@
 """Links and their names; MJCF and URDF as MuJoCo and yourdfpy read them."""
 
-from __future__ import annotations
-
-from pathlib import Path
 from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 import pytest
 
-from experiments.meshes import mesh_volume
 from exports import NAMES, angles_of, forward, lake_robot, odd_episode
 from laboratory import body
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.formats.export import export_robot
-from mjx_revolve.formats.links import make_links, make_meshes, rest_pose, roll_pitch_yaw
+from mjx_revolve.formats.links import make_links, rest_pose
 from mjx_revolve.formats.mjcf import make_mjcf
-from mjx_revolve.formats.urdf import make_urdf
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.numerics.spatial import quat_to_matrix
 from mjx_revolve.water.world import load_world
 
 
@@ -42,36 +36,6 @@ def test_links_stand_where_their_hinges_do(robot):
                 robot.morphology.modules[robot.fluid.module[part.row]].rgb or (0.5, 0.5, 0.5)
             )
     assert sum(link.mass for link in links) == pytest.approx(robot.morphology.mass)
-
-
-def test_names_are_plain_and_told_apart():
-    links = make_links(odd_episode().robot)
-    names = [link.name for link in links] + [part.name for link in links for part in link.parts]
-    names += [link.joint.name for link in links[1:]]
-    assert len({*names}) == len(names)
-    assert [link.name for link in links] == ["base_link", "arm_1_link", "arm_1_link_2"]
-    assert [link.joint.name for link in links[1:]] == ["arm_1", "arm_1_2"]
-    assert all(name.replace("_", "").isalnum() for name in names)
-
-
-def test_meshes_have_the_parts_volume(robot):
-    meshes = make_meshes(robot.morphology)
-    for link in make_links(robot):
-        for part in link.parts:
-            assert mesh_volume(meshes[part.mesh]) == pytest.approx(part.part.volume, rel=1e-6)
-
-
-@pytest.mark.parametrize("pitch", [0.3, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-7])
-def test_angles_turn_as_the_matrix_does(pitch):
-    def turn(axis, angle):
-        return quat_to_matrix([np.cos(angle / 2), *(np.sin(angle / 2) * np.eye(3)[axis])])
-
-    rotation = turn(2, -0.7) @ turn(1, pitch) @ turn(0, 2.1)
-    roll, back, yaw = roll_pitch_yaw(rotation)
-    np.testing.assert_allclose(turn(2, yaw) @ turn(1, back) @ turn(0, roll), rotation, atol=1e-9)
-
-
-# --- MJCF ---
 
 
 def load_mjcf(robot):
@@ -135,15 +99,6 @@ def test_mjcf_keeps_hinges_below_their_top_speed():
         np.testing.assert_allclose(data.qfrc_damper[6:], expected, rtol=1e-5)
 
 
-def test_mjcf_starts_below_the_surface_and_looks_like_the_robot():
-    model = load_mjcf(lake_robot("spider"))
-    assert model.key("start").qpos[2] == pytest.approx(-1.0)
-    geom = model.geom("core_core/mesh")
-    np.testing.assert_allclose(geom.rgba, [0.1, 0.2, 0.45, 1.0])
-    assert int(geom.group[0]) == 2 and int(model.geom("core/core").group[0]) == 3
-    assert model.hfield_nrow.size == 0  # the lake's bed is far down
-
-
 def test_mjcf_and_sdf_start_where_the_rollout_does(tmp_path):
     episode = odd_episode()
     files = {"mjcf": tmp_path / "a.xml", "sdf": tmp_path / "a.sdf"}
@@ -185,39 +140,6 @@ def test_mjcf_has_mujocos_own_drag_where_the_world_has(drag):
     assert (data.qfrc_passive[0] < 0) == (drag != "off")
 
 
-def test_mjcf_says_what_it_lacks():
-    text = make_mjcf(lake_robot("fish"))
-    note = text[: text.index("-->")]
-    assert "fins" in note and "a surface" in note and "bed" in note
-    waves = load_world("lake", waves=[{"amplitude": 0.05, "wavelength": 4.0}])
-    assert "the world's waves" in make_mjcf(build_robot(body("core"), waves))
-
-
-# --- URDF ---
-
-
-def test_urdf_is_the_same_robot_to_mujoco(robot):
-    ours, angles = robot.mj_model, angles_of(robot, 1)
-    model = mujoco.MjModel.from_xml_string(make_urdf(robot, meshes=None))
-    links = make_links(robot)
-    data = mujoco.MjData(model)
-    for link, angle in zip(links[1:], angles, strict=True):
-        joint = model.joint(link.joint.name)
-        data.qpos[joint.qposadr] = angle
-        np.testing.assert_allclose(joint.range, ours.jnt_range[link.body - 1], atol=1e-9)
-    mujoco.mj_kinematics(model, data)
-    position, rotation = forward(robot, angles)
-    for index, link in enumerate(links):
-        mine = model.body(link.name).id
-        assert model.body_mass[mine] == pytest.approx(link.mass)
-        np.testing.assert_allclose(model.body_ipos[mine], link.center_of_mass, atol=1e-9)
-        np.testing.assert_allclose(
-            np.sort(model.body_inertia[mine]), np.sort(ours.body_inertia[link.body]), rtol=1e-6
-        )
-        np.testing.assert_allclose(data.xpos[mine], position[index], atol=1e-9)
-        np.testing.assert_allclose(data.xmat[mine].reshape(3, 3), rotation[index], atol=1e-9)
-
-
 def test_urdf_is_the_same_robot_to_yourdfpy(robot, tmp_path):
     yourdfpy = pytest.importorskip("yourdfpy", reason="the package yourdfpy reads URDF")
     path = tmp_path / "robot.urdf"
@@ -244,14 +166,3 @@ def test_urdf_is_the_same_robot_to_yourdfpy(robot, tmp_path):
     for module in robot.morphology.modules:
         if module.rgb is not None:
             assert any(np.allclose(rgba[:3], module.rgb) for rgba in colors.values())
-
-
-def test_urdf_names_meshes_as_asked(tmp_path):
-    export_robot(
-        odd_episode().robot, {"urdf": tmp_path / "a.urdf"}, meshes="package://mine/meshes/"
-    )
-    root = ElementTree.parse(tmp_path / "a.urdf").getroot()
-    files = {mesh.get("filename") for mesh in root.iter("mesh")}
-    assert "package://mine/meshes/core_core.stl" in files
-    for file in files:
-        assert (tmp_path / "meshes" / Path(file).name).is_file()

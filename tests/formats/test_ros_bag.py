@@ -1,10 +1,6 @@
 """ROS 2 bags that rosbags wrote, as mcap-ros2-support reads them."""
 
-from __future__ import annotations
-
-import dataclasses
 import itertools
-import json
 from types import SimpleNamespace
 
 import mujoco
@@ -15,7 +11,6 @@ from exports import odd_episode
 from mjx_revolve.engine.forces import motor_torques
 from mjx_revolve.formats.links import make_links
 from mjx_revolve.formats.ros_bag import pick_rows, write_bag
-from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.spatial import quat_to_matrix
 
 
@@ -47,10 +42,6 @@ def bag(file_path):
         for _, channel, record, message in reader.iter_decoded_messages():
             found.setdefault(channel.topic, []).append((record.log_time, message))
     return SimpleNamespace(topics=found, summary=summary, header=header)
-
-
-def seconds(header):
-    return header.stamp.sec + 1e-9 * header.stamp.nanosec
 
 
 def test_bag_holds_every_pose_in_order(bag, episode):
@@ -163,23 +154,3 @@ def test_bag_describes_the_robot_without_files(bag, episode):
     model = mujoco.MjModel.from_xml_string(message.data)
     frames = {one.child_frame_id for one in bag.topics["/tf"][0][1].transforms}
     assert frames == {model.body(k).name for k in range(1, model.nbody)}
-
-
-def test_bag_ends_where_numbers_do(episode, tmp_path):
-    qpos = np.array(episode.trajectory.qpos)
-    qpos[50:] = np.nan
-    broken = dataclasses.replace(episode.trajectory, qpos=qpos)
-    rows, _ = pick_rows(episode.robot, broken)
-    assert rows[-1] == 49
-    qpos[:] = np.nan
-    with pytest.raises(InputError, match="rollout: expected finite poses"):
-        write_bag(episode.robot, broken, tmp_path / "a.mcap")
-
-
-def test_bags_metadata_names_its_file(file_path):
-    """`ros2 bag play rollout.mcap` reads these from the file itself."""
-    reader = pytest.importorskip("mcap.reader", reason="the package mcap reads bags")
-    with open(file_path, "rb") as file:
-        records = list(reader.make_reader(file).iter_metadata())
-    text = json.dumps(records[0].metadata)
-    assert "rollout.mcap" in text and records[0].name == "rosbag2"

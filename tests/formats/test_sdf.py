@@ -1,16 +1,13 @@
 """SDF: its poses, masses and water, by a reader of our own and by Gazebo's in Drake."""
 
-from __future__ import annotations
-
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
-from exports import NAMES, angles_of, forward, lake_robot
+from exports import NAMES, lake_robot
 from laboratory import body
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.formats.export import export_robot
 from mjx_revolve.formats.links import make_links, rest_pose
 from mjx_revolve.formats.sdf import make_sdf
 from mjx_revolve.numerics.spatial import quat_to_matrix
@@ -190,30 +187,3 @@ def test_sdf_of_a_world_without_water_has_none_and_its_bed_is_there():
     bed = root.find("world/model[@name='bed']")
     assert pose_of(bed)[0][2] == -1.5
     assert float(bed.findtext(".//mu")) == 0.7
-
-
-def test_sdf_and_urdf_are_the_same_robot_to_drake(tmp_path):
-    """Drake reads SDF by Gazebo's own library."""
-    pytest.importorskip("pydrake", reason="the package drake reads SDF")
-    from pydrake.multibody.parsing import Parser
-    from pydrake.multibody.plant import MultibodyPlant
-
-    for name in NAMES:
-        robot = lake_robot(name)
-        paths = {key: tmp_path / name / f"robot.{key}" for key in ("urdf", "sdf")}
-        export_robot(robot, paths)
-        angles, links = angles_of(robot, 3), make_links(robot)
-        position, rotation = forward(robot, angles)
-        for path in paths.values():
-            plant = MultibodyPlant(0.001)
-            Parser(plant).AddModels(str(path))
-            plant.Finalize()
-            context = plant.CreateDefaultContext()
-            assert plant.CalcTotalMass(context) == pytest.approx(robot.morphology.mass)
-            for link, angle in zip(links[1:], angles, strict=True):
-                plant.GetJointByName(link.joint.name).set_angle(context, angle)
-            base = plant.GetFrameByName("base_link")
-            for index, link in enumerate(links):
-                pose = plant.GetFrameByName(link.name).CalcPose(context, base)
-                np.testing.assert_allclose(pose.translation(), position[index], atol=1e-9)
-                np.testing.assert_allclose(pose.rotation().matrix(), rotation[index], atol=1e-9)

@@ -1,7 +1,5 @@
 """CPPN: bodies that a network describes, worked by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,6 @@ from mjx_revolve.genotypes.cppn import CPPN, Connection, Node
 from mjx_revolve.genotypes.cppn_genotype import grow
 from mjx_revolve.genotypes.genotype import Space
 from mjx_revolve.genotypes.kinds import find_genotype
-from mjx_revolve.inputs.errors import InputError
 
 SPACE = Space(MODULES, ("FixedBrick", "ActiveHinge"), "Core", 1, 30, 0, 20)
 # Inputs by number; outputs: no module, a brick, a hinge, quarter turns.
@@ -47,20 +44,6 @@ def test_a_cross_with_a_tail():
     assert [m.name for m in body.modules if m.slot == 1][:2] == ["ActiveHinge-1", "ActiveHinge-1-1"]
 
 
-def test_slots_are_asked_for_where_they_are():
-    """A brick scores 1 - 10 |x + 2 y + 3 z - 1 - depth|, all others 0."""
-    away = [(X, 9, 1.0), (Y, 9, 2.0), (Z, 9, 3.0), (ONE, 9, -1.0), (DEPTH, 9, -1.0)]
-    bricks = network(*away, (9, BRICK, -10.0), (ONE, BRICK, 1.0), nodes=[Node(9, "abs")])
-    # Depth 1: 2 at (0, 1) only. Depth 2: 3 of (0, 2), (1, 1), (-1, 1) at (1, 1), its right. Depth
-    # 3: 4 of (2, 1), (1, 2), (1, 0) at (2, 1), straight on; and so on to the right.
-    found = tree(grow(bricks, Space(MODULES, ("FixedBrick", "ActiveHinge"), "Core", 1, 5, 0, 4)))
-    assert found == [((1, 2, 1, 1)[:k], "FixedBrick", 0.0) for k in (1, 2, 3, 4)]
-    # With a quarter turn of all, the first one's right looks down and its left up: there and
-    # straight on it is -1, 5 and 4, and 3 nowhere.
-    turned = bricks._replace(links=(*bricks.links, Connection(ONE, TURN, 1.0)))
-    assert tree(grow(turned, SPACE)) == [((1,), "FixedBrick", 90.0)]
-
-
 def test_what_overlaps_is_left_out_and_bounds_are_kept():
     """Bricks everywhere: the nearest places first, no two at one place, as many as there may be."""
     everywhere = network((ONE, BRICK, 1.0))
@@ -75,17 +58,6 @@ def test_what_overlaps_is_left_out_and_bounds_are_kept():
         assert len(centers) == most
     short = Space(MODULES, ("FixedBrick", "ActiveHinge"), "Core", 1, 30, 0, 20, max_length=0.18)
     assert grow(everywhere, short).length <= 0.18
-
-
-def test_networks_of_other_spaces_are_refused():
-    genotype = find_genotype("cppn", SPACE, {}, "test.yaml")
-    with pytest.raises(
-        InputError, match=r"genome: expected 5 inputs and 4 outputs, for 2 types of"
-    ):
-        genotype.from_plain(CPPN(5, 5, (), ()).to_plain())
-    space = Space(MODULES, ("FixedBrick", "ActiveHinge"), "Core", 3, 30, 0, 20)
-    with pytest.raises(InputError, match="expected 3 to 30 modules; found 1"):
-        find_genotype("cppn", space, {}, "x").from_plain(CPPN(5, 4, (), ()).to_plain())
 
 
 @pytest.mark.parametrize("innovations", [True, False])

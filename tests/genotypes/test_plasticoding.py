@@ -1,23 +1,18 @@
 """Plasticoding: the L-system worked by hand, step by step."""
 
-from __future__ import annotations
-
 import numpy as np
-import pytest
 
 from laboratory import tree
 from mjx_revolve.body.catalogue import MODULES, load_modules
-from mjx_revolve.body.morphology import load_morphology, make_morphology
+from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.genotypes.genotype import Space
 from mjx_revolve.genotypes.kinds import find_genotype
 from mjx_revolve.genotypes.plasticoding import (
     Grammar,
-    PlasticodingSettings,
     draw_sentence,
     expand,
     make_alphabet,
 )
-from mjx_revolve.inputs.errors import InputError
 
 ALL = ("FixedBrick", "ActiveHinge", "TouchSensor", "Fin", "Thruster", "LiftThruster")
 SPACE = Space(MODULES, ALL, "Core", 1, 20, 0, 10)
@@ -27,8 +22,6 @@ LETTERS = make_alphabet(SPACE)
 def draw(sentence, space=SPACE, seed=None):
     return draw_sentence(sentence.split(), make_alphabet(space), space, seed=seed)
 
-
-# ------------------------------------------------------------------------- early development
 
 RULES = {
     "C": ("C", "addf", "AJ1", "moveb"),
@@ -65,9 +58,6 @@ def test_it_is_drawn_step_by_step():
     assert [m.name for m in body.modules] == ["core", "ActiveHinge-1", "TouchSensor-3"]
 
 
-# ------------------------------------------------------------------------- late development
-
-
 def test_modules_are_mounted_and_moved_on_to():
     # A letter without a side means nothing, and a side is used up by what is mounted there.
     assert tree(draw("C B AJ1")) == []
@@ -79,40 +69,6 @@ def test_modules_are_mounted_and_moved_on_to():
     # A joint has one slot, whatever the side; sensors, fins and thrusters carry nothing.
     assert [path for path, *_ in tree(draw("C addl AJ1 addr B"))] == [(3,), (3, 1)]
     assert [path for path, *_ in tree(draw("C addl ST addr F addf T"))] == [(1,), (2,), (3,)]
-
-
-def test_the_turtle_moves_to_what_is_there():
-    # Back to the core, on to the brick at the left again, and a joint behind it.
-    assert [path for path, *_ in tree(draw("C addl B moveb movel addf AJ1"))] == [(3,), (3, 1)]
-    # Nothing at the right: it stays. Back from the core is nowhere.
-    assert [path for path, *_ in tree(draw("C addl B moveb mover moveb addf AJ1"))] == [(1,), (3,)]
-    # On a joint all ways lead on.
-    further = draw("C addf AJ1 addf B moveb moveb movef mover addl B")
-    assert [path for path, *_ in tree(further)] == [(1,), (1, 1), (1, 1, 3)]
-    # Not on to a sensor.
-    assert [path for path, *_ in tree(draw("C addf ST movef addl B"))] == [(1,), (3,)]
-
-
-def test_the_back_of_a_core_comes_last():
-    three = "C addf B moveb addr B moveb addl B moveb"
-    assert [path for path, *_ in tree(draw(three))] == [(1,), (2,), (3,)]
-    assert [path for path, *_ in tree(draw(f"{three} addr AJ1"))] == [(0,), (1,), (2,), (3,)]
-    # Before, a side that is taken is taken; and a fifth module has no place.
-    assert [path for path, *_ in tree(draw("C addf B moveb addf B"))] == [(1,)]
-    assert tree(draw(f"{three} addr ST addr ST"))[0] == ((0,), "TouchSensor", 0.0)
-    assert len(tree(draw(f"{three} addr ST addr ST addl ST"))) == 4
-
-
-def test_upright_and_level():
-    """Revolve's turns: 90 from level to upright, 270 back, 0 for more of the same."""
-    assert [turn for *_, turn in tree(draw("C addf AJ2 addf B addf AJ1"))] == [90.0, 270.0, 0.0]
-    assert [turn for *_, turn in tree(draw("C addf AJ2 addf AJ2 addf BV addf FV"))] == [
-        90.0, 0.0, 0.0, 0.0
-    ]  # fmt: skip
-    level = draw("C addf AJ2 addf AJ1")
-    # AJ1 bends about a level axis, AJ2 about the upright.
-    axes = [m.rotation @ m.kind.hinge.axis for m in level.modules[1:]]
-    assert abs(axes[0][2]) == pytest.approx(1.0) and abs(axes[1][2]) == pytest.approx(0.0)
 
 
 def test_what_overlaps_or_exceeds_is_left_out():
@@ -129,9 +85,6 @@ def test_what_overlaps_or_exceeds_is_left_out():
     assert [kind for _, kind, _ in tree(draw("C addf AJ1 addf AJ1 B", space))] == [
         "ActiveHinge", "FixedBrick"
     ]  # fmt: skip
-
-
-# ------------------------------------------------------------------------- the alphabet
 
 
 def test_letters_are_revolves_where_it_has_them(tmp_path):
@@ -159,9 +112,6 @@ modules:
     # Sides that it does not have are no slots; the others come when its front is taken.
     body = draw("C addf Tee addl Tee addf Tee moveb addl Tee moveb addr Tee", space)
     assert [path for path, *_ in tree(body)] == [(1,), (1, 1), (1, 5), (1, 7)]
-
-
-# ------------------------------------------------------------------------- genomes
 
 
 def test_random_rules_are_groups_of_three():
@@ -236,46 +186,3 @@ def test_a_robot_is_spelled_out():
     assert gone == {"left_thigh", "left_knee", "left_foot"}
     kept = {m.name: m for m in spider.modules}
     assert all((kept[m.name].position == m.position).all() for m in less.modules)
-
-
-def test_names_of_a_seed_are_kept_for_it():
-    """What grows at a place that a seed's module elsewhere is named after is told apart."""
-    children = {3: {"id": "FixedBrick-1", "type": "FixedBrick"}}
-    seed = make_morphology({"id": "core", "type": "Core", "children": children})
-    for sentence in ("C addf B #FixedBrick-1", "C #FixedBrick-1 moveb addf B"):
-        body = draw(sentence, seed=seed)
-        names = {m.slot: m.name for m in body.modules[1:]}
-        assert names == {1: "FixedBrick-1_2", 3: "FixedBrick-1"}
-
-
-DAMAGED = {
-    "rule missing": ({"B": None}, "genome.rules: expected one for B; found none"),
-    "no core": ({"C": ["addf", "B"]}, "genome.rules.C: expected C at its beginning; found"),
-    "letter": ({"B": ["addf", "X"]}, "genome.rules.B: expected known letters; found 'X'"),
-    "seed": ({"C": ["C", "#hip"]}, "genome.rules.C: expected known letters; found '#hip'"),
-    "strange": ({"X": ["addf"]}, "genome.rules.X: expected a letter of C, B, BV, AJ1, AJ2, ST"),
-}
-
-
-@pytest.mark.parametrize(("rules", "message"), DAMAGED.values(), ids=DAMAGED)
-def test_damaged_grammars_are_refused(rules, message):
-    genotype = find_genotype("plasticoding", SPACE, {}, "test.yaml")
-    plain = genotype.to_plain(genotype.random(np.random.default_rng(0)))
-    assert genotype.from_plain(plain)
-    changed = {k: rule for k, rule in (plain["rules"] | rules).items() if rule is not None}
-    with pytest.raises(InputError) as error:
-        genotype.from_plain(plain | {"rules": changed})
-    assert str(error.value).startswith(message)
-
-
-def test_settings():
-    with pytest.raises(InputError, match="expected a number > 0 among add, delete and swap"):
-        PlasticodingSettings(add=0, delete=0, swap=0)
-    with pytest.raises(InputError, match=r"bodies.params.iteration: .*did you mean iterations\?"):
-        find_genotype("plasticoding", SPACE, {"iteration": 1}, "a.yaml")
-    # A rule of many letters takes no more.
-    short = find_genotype(
-        "plasticoding", SPACE, {"add": 1, "delete": 0, "swap": 0, "max_rule": 3, "groups": 1}, "x"
-    )
-    genome = short.random(np.random.default_rng(0))
-    assert short.mutate(np.random.default_rng(1), genome) is genome

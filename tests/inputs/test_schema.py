@@ -1,16 +1,12 @@
 """Checked values: what they take, and every kind of complaint in one line."""
 
-from __future__ import annotations
-
 import dataclasses
-import math
 import pickle
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import pytest
-from annotated_types import Ge, Le, Lt, MinLen, Unit
-from pydantic import BaseModel
+from annotated_types import Ge, Lt, Unit
 
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.schema import (
@@ -31,7 +27,6 @@ from mjx_revolve.inputs.schema import (
     read,
     words,
 )
-from mjx_revolve.inputs.validation_messages import describe
 
 
 @checked
@@ -101,28 +96,13 @@ NAMES = "name, axis, place, leaves, by_number, first, age, mass, shade, green"
     ("values", "message"),
     [
         ({"name": 3}, "name: expected a name; found 3"),
-        ({"axis": (0, 0, 0)}, "axis: expected a direction, not zero; found [0.0, 0.0, 0.0]"),
-        ({"mass": 1e39}, "mass: expected a number between -3.4e+38 and 3.4e+38; found 1e+39"),
         ({"place": (1, 2)}, "place: expected three numbers [m]; found (1, 2)"),
-        ({"place": (1, True, 3)}, "place.1: expected a number [m]; found True"),
-        ({"place": (1, 2, math.nan)}, "place.2: expected a number [m]; found nan"),
         ({"place": (10**5000, 2, 3)}, "place.0: expected a number [m]; found a huge integer"),
-        ({"leaves": 3}, "leaves: expected a list of mappings with length; found 3"),
         ({"leaves": [{}]}, "leaves.0.length: expected a number > 0 [m]; found none"),
-        (
-            {"leaves": [Leaf(1), {"length": 2, "range": [1, "a"]}]},
-            "leaves.1.range.1: expected a number [rad]; found 'a'",
-        ),
         ({"by_number": {"a": {}}}, "by_number: expected a whole number >= 0; found 'a'"),
-        ({"by_number": {2: {"length": -1}}}, "by_number.2.length: expected a number > 0 [m]; fo"),
         ({"first": 3}, "first: expected a mapping with length, or nothing; found 3"),
-        ({"age": 2**32}, "age: expected a whole number >= 0 and < 4294967296; found 4294967296"),
-        ({"mass": -1}, "mass: expected a number >= 0 [kg], or nothing; found -1"),
         ({"shade": "much"}, "shade: expected one of some, off; found 'much'"),
-        ({"green": 1}, "green: expected true or false; found 1"),
         ({"gren": 1}, f"gren: expected one of {NAMES}; found an unknown key; did you mean green?"),
-        ({"lenght": 1}, f"expected one of {NAMES}; found an unknown key; did you mean first.leng"),
-        ({"first": {3: 4}}, "first.3: expected the name of a setting; found a key that is no t"),
         (
             {"age": -1, "green": 1, "colour": 2},
             f"colour: expected one of {NAMES}; found an unknown key (and 2 more: age, green)",
@@ -138,37 +118,3 @@ def test_complaints(values, message):
         assert message in found and "\n" not in found
         if name != "here":
             assert found.startswith(f"tree {given['name']!r}: ")
-
-
-def test_places_go_in_front():
-    with pytest.raises(InputError, match=r"^garden.2.leaves.0: expected a mapping with length; f"):
-        read(Tree, {"name": "ash", "leaves": [3]}, "garden.2")
-    with pytest.raises(InputError, match=r"^garden: expected a mapping with name; found 3$"):
-        read(Tree, 3, "garden")
-    with pytest.raises(InputError, match=r"^leaf: length: expected a number > 0 \[m\]; found none"):
-        Leaf()
-
-
-class Model(BaseModel):
-    """Described like a checked class."""
-
-    leaf: Leaf
-    size: Annotated[float, Ge(0.5), Le(2)] = 1.0
-
-
-@pytest.mark.parametrize(
-    ("kind", "text"),
-    [
-        (Number, "a number"),
-        (Annotated[Number, Ge(-0.5), Le(1), Unit("m")], "a number >= -0.5 and <= 1 [m]"),
-        (Annotated[Number, Unit("m")] | None, "a number [m], or nothing"),
-        (str | dict[str, Any], "a text or a mapping"),
-        (TupleOf[Number], "a list of numbers"),
-        (Annotated[TupleOf[Integer], MinLen(1)], "a list of whole numbers"),
-        (Annotated[Pair[NonNegative], Unit("s")], "two numbers >= 0 [s]"),
-        (Annotated[str, words("a colour")], "a colour"),
-        (Model, "a mapping with leaf"),
-    ],
-)
-def test_types_in_words(kind, text):
-    assert describe(kind) == text

@@ -1,7 +1,5 @@
 """Names of shipped files: where a path is taken, a name will do."""
 
-from __future__ import annotations
-
 import os
 import shutil
 
@@ -13,8 +11,8 @@ from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.episodes.champion import load_episode, load_genes
 from mjx_revolve.episodes.config import load_config
 from mjx_revolve.episodes.fitness import make_fitness
-from mjx_revolve.episodes.run_reader import find_run, load_metrics
-from mjx_revolve.evolution.run_folder import load_archive, open_run_folder
+from mjx_revolve.episodes.run_reader import load_metrics
+from mjx_revolve.evolution.run_folder import load_archive
 from mjx_revolve.inputs.commands import check_episode_path, run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.shipped import find_shipped, list_shipped
@@ -40,17 +38,6 @@ def test_help_lists_what_comes_with_the_package(capsys):
     out = capsys.readouterr().out
     assert "\n  lake_colony " in out and "auv, " in out
     assert out.endswith(f"mjx_revolve {__version__}\n")
-
-
-def test_one_run_of_a_sweep_is_to_be_named(tmp_path):
-    (tmp_path / "a" / "seed_0").mkdir(parents=True)
-    for name in ("sweep.yaml", "a/seed_0/config.yaml"):
-        (tmp_path / name).touch()
-    found = f"found a sweep of several, such as {tmp_path}/a/seed_0"
-    for read in (check_episode_path, find_run, open_run_folder):
-        with pytest.raises(InputError) as error:
-            read(tmp_path)
-        assert str(error.value) == f"{tmp_path}: expected one run; {found}"
 
 
 def test_a_file_of_that_path_wins(monkeypatch, tmp_path):

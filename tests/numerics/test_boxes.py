@@ -1,7 +1,5 @@
 """Penetration of turned boxes: against MuJoCo's collisions, and by moving them apart."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import mujoco

@@ -1,7 +1,5 @@
 """The compiler tricks: identities to JAX, and noticed when XLA stops taking them."""
 
-from __future__ import annotations
-
 import re
 from functools import partial
 
@@ -16,7 +14,6 @@ from mjx_revolve.numerics.xla import (
     fuse,
     fuse_outermost,
     fuse_step,
-    materialize,
     on_cpu,
     over_chunks,
 )
@@ -122,14 +119,6 @@ def test_chunks_are_all_of_one_shape():
     assert set(seen) == {(4,)}
 
 
-def test_a_materialized_value_is_stored_though_it_is_used_once():
-    x, y = jnp.ones(4), jnp.ones((8, 4))
-    plain = lambda x, y: jnp.tanh(x)[None] * y  # noqa: E731
-    marked = lambda x, y: materialize(jnp.tanh(x))[None] * y  # noqa: E731
-    assert (xla.Graph(plain, (x, y)).size, xla.Graph(marked, (x, y)).size) == (0, 1)
-    assert np.array_equal(xla.Graph(marked, (x, y))(x, y), plain(x, y))
-
-
 @pytest.mark.skipif(not on_cpu(), reason="the annotations are for CPUs")
 def test_a_function_is_fused_once_whatever_its_caller_does():
     """By itself it is fused, with its numbers as they are; within a fused function it is not."""
@@ -145,14 +134,6 @@ def test_a_function_is_fused_once_whatever_its_caller_does():
     assert "materialize" in str(alone) and str(within) == str(plainly)
     assert set(map(type, seen)) == {float}
     assert (fuse_outermost(scaled, LANES, 2.0) == step(2.0 * LANES)).all()
-
-
-def test_a_materialized_value_has_batches_and_gradients():
-    fun = lambda x: jnp.sum(materialize(jnp.tanh(x)) * x)  # noqa: E731
-    expected = jax.jit(jax.grad(lambda x: jnp.sum(jnp.tanh(x) * x)))(LANES)
-    np.testing.assert_allclose(jax.jit(jax.grad(fun))(LANES), expected, rtol=1e-6)
-    both = jax.jit(jax.vmap(fun))(jnp.stack([LANES, 2 * LANES]))
-    np.testing.assert_allclose(both, [fun(LANES), fun(2 * LANES)], rtol=1e-6)
 
 
 def test_without_the_annotations_the_results_are_the_same(monkeypatch):

@@ -9,7 +9,6 @@ from matplotlib.path import Path
 from mjx_revolve.episodes.bodies_config import ArchiveConfig
 from mjx_revolve.evolution.archive import cell_of, filled, insert, make_archive
 from mjx_revolve.view.archive_map import plot_archive, voronoi_cells
-from mjx_revolve.view.plots import figure_png, figure_svg
 
 VIRIDIS = colormaps["viridis"]
 AXES = {
@@ -99,27 +98,3 @@ def test_a_line_for_each_individual(count, kind):
     assert lines[-1][:, 1] == pytest.approx(heights)  # on top
     assert star(figure) == pytest.approx([count - 1, heights[-1]])
     assert len(axes.get_xticklabels()) == count
-
-
-def test_the_champion_is_marked_where_it_is():
-    found = archive(2, count=4)
-    worst = int(np.nanargmin(found.scores))
-    figure = plot_archive(found, champion=int(found.ids[worst]))
-    assert star(figure) == found.centers[worst].tolist()
-    assert "champion: " in figure.axes[0].get_title(loc="left")
-    assert star(plot_archive(found, champion=77)) is None
-
-
-@pytest.mark.filterwarnings("error::UserWarning")
-@pytest.mark.parametrize(("axes", "kind"), [(2, "grid"), (2, "cvt"), (4, "grid"), (5, "grid")])
-@pytest.mark.parametrize("count", [0, 1])
-def test_archives_with_nobody_or_one(axes, kind, count):
-    figure = plot_archive(archive(axes, kind, count=count))
-    assert (star(figure) is None) == (count == 0)
-    assert figure_png(figure)[:4] == b"\x89PNG"
-
-
-def test_the_same_archive_is_the_same_picture():
-    assert figure_svg(plot_archive(archive(2, "cvt"))) == figure_svg(
-        plot_archive(archive(2, "cvt"))
-    )

@@ -3,25 +3,16 @@
 import json
 import math
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from browser import Browser, find_browser
-from mjx_revolve import export, replay, report, viewer
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import make_morphology
-from mjx_revolve.episodes.champion import champion_number, load_episode, load_individuals
-from mjx_revolve.episodes.individual_log import find_individuals, read_generations, read_individuals
-from mjx_revolve.inputs.commands import run_command
-from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.body_pictures import SIZE, draw_bodies, plot_best, plot_descriptors
-from mjx_revolve.view.convergence import plot_fitness
-from mjx_revolve.view.pieces import make_pieces
+from mjx_revolve.episodes.individual_log import read_generations, read_individuals
+from mjx_revolve.view.body_pictures import SIZE, draw_bodies
 from mjx_revolve.view.population import (
     pick_ancestors,
-    pick_evenly,
     read_population,
     trace_lineage,
 )
@@ -106,9 +97,6 @@ def show(*folders):
     return report_page.make_report([read_run(folder) for folder in folders])
 
 
-# --- who lived ---
-
-
 def test_lives_are_read_back(run):
     lives, problems = read_individuals(run)
     assert problems == [] and list(lives) == [0, 1, 2, 3, 4, 5]
@@ -136,14 +124,6 @@ def test_damaged_lines_are_left_out(run, line):
     assert problems == ["individuals.jsonl: 1 line is damaged and left out"]
 
 
-def test_damaged_generations_are_left_out(run):
-    with open(run / "generations.jsonl", "a") as file:
-        file.write('{"generation": 4, "living": [1.5]}\n{"generation": 5}\n{"generation": 6, "liv')
-    found, problems = read_generations(run)
-    assert list(found) == [1, 2, 3]
-    assert problems == ["generations.jsonl: 2 lines are damaged and left out"]
-
-
 def test_who_was_best_and_who_came_of_whom(run):
     population, problems = read_population(run)
     assert problems == []
@@ -162,45 +142,6 @@ def test_who_was_best_and_who_came_of_whom(run):
     assert pick_ancestors(population, 77, 3) == []
 
 
-def test_of_a_long_line_those_stay_who_gained_most(tmp_path):
-    scores = [0.0, 0.1, 0.15, 0.5, 0.4, 0.9, 0.91]
-    born = [(k, [k - 1] * (k > 0), k + 1, "mutation", s, 1) for k, s in enumerate(scores)]
-    run = make_run(tmp_path / "long", born=born, living={7: [6]})
-    population, _ = read_population(run)
-    family = trace_lineage(population, 6, most=4)
-    assert [(kin.life.number, kin.skipped) for kin in family] == [(0, 0), (3, 2), (5, 1), (6, 0)]
-    assert [life.number for life in pick_ancestors(population, 6, 3)] == [0, 2, 4, 6]
-    assert pick_evenly([1, 2, 3, 4, 5], 3) == [1, 3, 5]
-    assert pick_evenly([4], 3) == [4] and pick_evenly([], 3) == []
-
-
-def test_without_generations_the_living_are_not_known(run):
-    (run / "generations.jsonl").unlink()
-    population, (problem,) = read_population(run)
-    assert population.living == {} and population.best().number == 5
-    assert problem.startswith("generations.jsonl names none")
-    (run / "generations.jsonl").write_text('{"generation":1,"living":[0,8,9]}\n')
-    assert read_population(run)[1] == ["individuals.jsonl lacks 2 of the living"]
-
-
-def test_numbers_are_checked(run, tmp_path):
-    assert [life.number for life in find_individuals(run, [4, 1])] == [4, 1]
-    with pytest.raises(InputError, match="expected individual 6; found those from 0 to 5"):
-        find_individuals(run, [1, 6])
-    with pytest.raises(InputError, match="individual 2: genes: expected 10; found none: every"):
-        load_episode(run, individual=2)
-    assert champion_number(run) == 5
-    (run / "config.yaml").write_text(
-        json.dumps(SETTINGS | {"bodies": None, "morphology": "m.yaml"})
-    )
-    (run / "m.yaml").write_text(json.dumps(body(1)))
-    with pytest.raises(InputError, match="expected a run in which bodies evolve"):
-        load_episode(run, individual=1)
-
-
-# --- pictures ---
-
-
 def test_pictures_have_one_scale_and_fit():
     small, large = (make_morphology(body(hinges), MODULES) for hinges in (1, 4))
     together = draw_bodies([small, large])
@@ -215,46 +156,6 @@ def test_pictures_have_one_scale_and_fit():
     alone = (draw_bodies([small])[0] < 250).any(axis=-1)
     assert alone.sum() > 1.2 * drawn[0].sum()
     assert draw_bodies([]) == []
-
-
-def test_modules_without_a_colour_have_that_of_their_kind():
-    plain = make_morphology(body(1), MODULES)
-    pieces = [piece for piece in make_pieces(plain) if not piece.mark]
-    assert len({tuple(piece.color) for piece in pieces}) == 3  # core, and both parts of a hinge
-    named = body(1)
-    named["body"]["params"] = {"red": 0.1, "green": 0.2, "blue": 0.3}
-    assert make_pieces(make_morphology(named, MODULES))[0].color.tolist() == [0.1, 0.2, 0.3]
-
-
-def test_a_sheet_of_the_best(run):
-    figure = plot_best(run, MODULES, "a $title")
-    texts = [text.get_text() for axes in figure.axes for text in axes.texts]
-    assert texts == ["5: 0.5", "4 modules, 3 hinges", "3: 0.3", "3 modules, 2 hinges",
-                     "4: 0.2", "2 modules, 1 hinge"]  # fmt: skip
-    figure.canvas.draw()  # a dollar is no formula
-
-
-def test_fitness_has_how_large_bodies_are():
-    metrics = {"generation": np.arange(1.0, 4), "best": np.ones(3), "champion": np.ones(3),
-               "mean_num_modules": np.array([4.0, 5.0, 6.0])}  # fmt: skip
-    figure = plot_fitness(metrics)
-    (axes,) = [axes for axes in figure.axes if axes.get_ylabel() == "modules, mean\nof the living"]
-    assert axes.lines[0].get_ydata().tolist() == [4.0, 5.0, 6.0]
-
-
-def test_sizes_over_the_generations(run):
-    population, _ = read_population(run)
-    figure = plot_descriptors(population, ("speed_m_s",))
-    panels = {axes.get_title(loc="left"): axes for axes in figure.axes}
-    assert list(panels)[:3] == ["speed over ground (m/s)", "number of modules", "number of hinges"]
-    mean, best = panels["number of hinges"].lines
-    assert mean.get_xdata().tolist() == [1, 2, 3]
-    assert np.allclose(mean.get_ydata(), [2.0, 5 / 3, 2.0])
-    assert best.get_ydata().tolist() == [2.0, 2.0, 3.0]
-    assert plot_descriptors(read_population(Path("/nowhere"))[0]) is None
-
-
-# --- the page ---
 
 
 @pytest.mark.slow
@@ -299,59 +200,6 @@ def test_cells_of_the_archive_are_links(tmp_path, still):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(find_browser() is None, reason="needs Chromium or Chrome")
-def test_a_click_on_a_cell_shows_who_lives_there(tmp_path, still):
-    run = make_run(tmp_path / "run", ARCHIVE)
-    record = read_run(run)
-    (tmp_path / "report.html").write_text(report_page.make_report([record]))
-    card = f"document.getElementById('{report_bodies.anchor(record, 3)}')"
-    with Browser(900, 700) as browser:
-        browser.send("Page.navigate", url=(tmp_path / "report.html").as_uri())
-        browser.wait("document.readyState === 'complete' && !!document.querySelector('.map svg a')")
-        assert browser.evaluate(f"{card}.offsetHeight") == 0
-        link = f".map a[*|href='#{report_bodies.anchor(record, 3)}']"
-        browser.evaluate(f'document.querySelector("{link}").scrollIntoView()')
-        browser.click(link)
-        browser.wait(f"{card}.offsetHeight > 100")
-        assert "--individual 3" in browser.evaluate(f"{card}.textContent")
-        assert browser.errors == []
-
-
-def test_whose_pages_are_asked_for(run, tmp_path):
-    record = read_run(run)
-    assert report_bodies.choose_individuals(record, [4, 1, 4]) == [4, 1]
-    assert report_bodies.choose_individuals(record, "best") == [5, 3, 4, 1]
-    with pytest.raises(InputError, match="expected individual 6; found none"):
-        report_bodies.choose_individuals(record, [6])
-    with pytest.raises(InputError, match="expected a run with an archive; found none"):
-        report_bodies.choose_individuals(record, "archive")
-    kept = read_run(make_run(tmp_path / "archive", ARCHIVE))
-    assert report_bodies.choose_individuals(kept, "archive") == [4, 3, 5]
-
-
-def test_pages_that_are_there_stay(run, monkeypatch):
-    asked = []
-
-    def load(folder, numbers):
-        asked.append(list(numbers))
-        return [f"episode {number}" for number in numbers]
-
-    def write(episode, path, forces):
-        assert not forces
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(episode)
-
-    monkeypatch.setattr(report_bodies, "load_individuals", load)
-    monkeypatch.setattr(report_bodies, "write_viewer", write)
-    record = read_run(run)
-    assert report_bodies.write_pages(record, [5, 3]) == 2
-    assert report_bodies.write_pages(record, [3, 4]) == 1
-    assert report_bodies.write_pages(record, [3, 4]) == 0
-    assert asked == [[5, 3], [4]]
-    assert (run / "individuals/4.html").read_text() == "episode 4"
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -367,83 +215,3 @@ def test_what_is_left_is_shown(run, still, damage, message):
     assert message in record.warning
     page = report_page.make_report([record])
     assert ("Body of individual" in page) == (run / "individuals.jsonl").is_file()
-
-
-@pytest.mark.slow
-def test_a_body_that_cannot_be_read_has_no_picture(run, still):
-    path = run / "individuals.jsonl"
-    path.write_text(path.read_text().replace("ActiveHinge", "Wheel", 3))
-    record = read_run(run)
-    page = report_page.make_report([record])
-    assert "individual 0: " in record.warning and "Wheel" in record.warning
-    assert page.count('alt="Body of individual 0"') == 0 and "<b>#0</b>" in page
-
-
-# --- commands ---
-
-
-@pytest.mark.parametrize(
-    ("main", "argv", "message"),
-    [
-        (report, ["run", "--individuals", "worst"], "expected best, archive, or numbers"),
-        (report, ["run", "--individuals", "archive"], "expected a run with an archive"),
-        (viewer, ["run", "--individual", "77"], "expected individual 77; found those from 0 to 5"),
-        (export, ["spider", "--individual", "1"], "expected a run folder; found no config.yaml"),
-        (replay, ["run", "--ancestors", "0"], "expected a whole number from 1 to 30"),
-        (viewer, ["run", "--individual", "1", "--world", "lake"], "expected none: a champion"),
-    ],
-)
-def test_wrong_commands(run, main, argv, message, capsys):
-    assert run_command(main.main, argv) == 2
-    assert message in capsys.readouterr().err
-
-
-def test_a_film_of_ancestors(run, monkeypatch, capsys):
-    """The line at equal distances, each for five seconds at most, in one file."""
-    asked, made = [], []
-
-    class Episode(str):
-        """Stands for one; films are not drawn here."""
-
-    def load(folder, numbers, duration, seed):
-        asked.append((list(numbers), duration))
-        return [Episode(number) for number in numbers]
-
-    class Film:
-        lost, fps, size, time, robots = None, 10, (64, 64), range(30), (None,)
-
-    def write(films, opengl, mp4, gif):
-        made.append((len(films), mp4, gif))
-        mp4.parent.mkdir(exist_ok=True)
-        mp4.write_bytes(b"film")
-
-    cuts = []
-    monkeypatch.setattr("mjx_revolve.replay.find_opengl", lambda: "egl")
-    monkeypatch.setattr("mjx_revolve.episodes.champion.load_individuals", load)
-    monkeypatch.setattr("mjx_revolve.view.poses.cut_episode", lambda e, s: cuts.append(s) or e)
-    monkeypatch.setattr("mjx_revolve.view.film.film.make_film", lambda *_: Film())
-    monkeypatch.setattr("mjx_revolve.view.film.video.write_film", write)
-    assert run_command(replay.main, ["run", "--ancestors", "1"]) == 0
-    assert run_command(replay.main, ["run", "--ancestors", "4", "--individual", "4",
-                                     "--duration", "2"]) == 0  # fmt: skip
-    assert asked == [([1, 5], None), ([0, 4], 2.0)] and cuts == [5.0, 5.0]
-    assert [entry[1].name for entry in made] == ["ancestors.mp4", "4-ancestors.mp4"]
-    assert "6 s, 2 robots" in capsys.readouterr().out
-
-
-@pytest.mark.long
-def test_many_swim_as_each_does_alone(run):
-    """One compiled program for all gives what each gets alone, up to rounding."""
-    together = load_individuals(run, [1, 5], seed=3)
-    for number, many in zip([1, 5], together, strict=True):
-        alone = load_episode(run, individual=number, seed=3)
-        every = round(float(many.trajectory.time[0] / alone.trajectory.time[0]))
-        assert every > 1 and len(alone.trajectory.time) == every * len(many.trajectory.time)
-        for name in ("time", "qpos", "xpos", "ctrl"):
-            rows = np.asarray(getattr(alone.trajectory, name))[every - 1 :: every]
-            assert np.allclose(getattr(many.trajectory, name), rows, atol=2e-5), name
-        assert np.ptp(np.asarray(many.trajectory.qpos)[:, 7:]) > 0.01
-        assert (many.score, many.starts) == (
-            alone.score,
-            f"generation {1 if number == 1 else 3}'s starts",
-        )

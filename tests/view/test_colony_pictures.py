@@ -8,16 +8,13 @@ import yaml
 
 from laboratory import QUICK
 from mjx_revolve import report, viewer
-from mjx_revolve.episodes.colony_config import ColonyConfig, EnergyConfig
 from mjx_revolve.episodes.individual_log import Event, read_events
-from mjx_revolve.evolution.colony_observer import observe_colony, open_colony
+from mjx_revolve.evolution.colony_observer import open_colony
 from mjx_revolve.evolve import main
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.colony_history import make_history
-from mjx_revolve.view.colony_pictures import plot_arena, plot_families, plot_population
-from mjx_revolve.view.convergence import plot_colony, scale_time
-from mjx_revolve.view.plots import figure_png
+from mjx_revolve.view.colony_pictures import plot_population
 from mjx_revolve.view.population import trace_line
 from mjx_revolve.view.report.data import read_run
 
@@ -40,11 +37,7 @@ def history():
     return make_history(EVENTS, {0: 0.1, 2: 0.3}, 60.0)
 
 
-# --- logs ---
-
-
 def test_events_are_read_back(tmp_path):
-    """Damaged lines are left out and counted; one that is being written is no damage."""
     base = {"id": 0, "place": [1, 2, -1]}
     born = {"time": 0.0, "event": "birth", "place": [1, 2, None], "parents": [], "origin": ""}
     good = [
@@ -80,17 +73,7 @@ def test_history_by_hand(history):
     assert history.spans[2].score == 0.3 and np.isnan(history.spans[1].score)
 
 
-# --- pictures ---
-
-
-def test_time_axes_have_units_that_suit():
-    assert [scale_time(x) for x in (100.0, 7200.0, 20000.0)] == [
-        (1.0, "time (s)"), (60.0, "time (min)"), (3600.0, "time (h)")
-    ]  # fmt: skip
-
-
 def test_births_and_deaths_add_up(history):
-    """Bars upwards are the births, those downwards the deaths."""
     top, low = plot_population(history, 8).axes
     bars = np.array([patch.get_height() for patch in low.patches])
     assert bars[bars > 0].sum() == 5 and bars[bars < 0].sum() == -2
@@ -98,37 +81,6 @@ def test_births_and_deaths_add_up(history):
     assert labels == ["children born", "strangers born", "died of age", "died of something else"]
     assert top.lines[0].get_ydata().max() == 4
 
-
-def test_families_stand_together(history):
-    """Down the tree: 0, its child 2 and grandchild 3, then the others; the champion's line."""
-    top, low = plot_families(history, champion=3).axes
-    line = next(x for x in low.lines if len(x.get_xdata()) > 1)
-    assert line.get_xdata().tolist() == [0, 20, 20, 40, 40, 50]
-    assert line.get_ydata().tolist() == [0, 0, 1, 1, 2, 2]
-    assert top.get_legend_handles_labels()[1] == ["of #0", "others"]
-
-
-def test_empty_and_odd_histories_are_drawn():
-    """Nobody was born, or in one moment only: no picture complains."""
-    colony = ColonyConfig(energy=EnergyConfig(chargers=((1, 0, -2),)))
-    for history in (make_history([], {}, 0.0), make_history(EVENTS[:1], {}, 0.0)):
-        for figure in (
-            plot_population(history),
-            plot_families(history),
-            plot_arena(history, colony),
-        ):
-            assert figure_png(figure).startswith(b"\x89PNG")
-
-
-def test_fitness_with_what_is_not_known_yet():
-    """In the first intervals nobody has lived for long enough to be a champion."""
-    row = np.array([1.0, 2.0])
-    metrics = {"time": 10 * row, "champion": row * np.nan, "mean_age": row}
-    metrics |= dict.fromkeys(("best", "median", "lower_quartile", "upper_quartile"), row)
-    assert figure_png(plot_colony(metrics, "a $x title"))
-
-
-# --- a run ---
 
 SETTINGS = {
     "trim": "neutral",
@@ -165,15 +117,8 @@ def run(tmp_path_factory):
         yield folder / "run"
 
 
-@pytest.mark.long
-def test_a_run_leaves_its_pictures(run):
-    for name in ("fitness", "population", "families", "arena", "bodies"):
-        assert (run / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-
-
 @pytest.mark.slow
 def test_the_report_of_a_colony(run, tmp_path):
-    """Its own section, its own words, nothing that speaks of generations' starts."""
     page = tmp_path / "page.html"
     assert run_command(report.main, [str(run), "--out", str(page)]) == 0
     text = page.read_text()
@@ -181,22 +126,6 @@ def test_the_report_of_a_colony(run, tmp_path):
     assert "own generation's starts" not in text and "After generation" not in text
     assert "intervals" in text and "fitness in the colony" in text
     assert read_run(run).history.spans.keys() == read_run(run).population.lives.keys()
-
-
-@pytest.mark.slow
-def test_what_is_watched_is_what_happened(run):
-    """From the checkpoint in the middle to the end, as the run's own log has it."""
-    config, fitness, search, begin = open_colony(run, 8.0)
-    assert begin == 8.0 and search.generation == 4
-    sights, events = observe_colony(config, fitness, search, begin, 8.0, 0.05)
-    logged = [json.loads(line) for line in (run / "events.jsonl").read_text().splitlines()]
-    same = [(e["event"], e["id"]) for e in logged if e["time"] > 8.0]
-    assert [(e["event"], e["id"]) for e in events] == same and same
-    for sight in sights:
-        assert sight.qpos.shape == (len(sight.time), 7 + sight.robot.num_hinges)
-        assert np.all(np.diff(sight.time) == pytest.approx(0.05))
-        assert sight.time[0] >= sight.born and (sight.end or 16.0) >= sight.time[-1] - 1e-6
-        assert np.isfinite(sight.qpos).all()
 
 
 @pytest.mark.slow
@@ -209,14 +138,6 @@ def test_the_page_of_a_run(run, capsys):
     for wrong in (["--individual", "1"], ["--seed", "1"]):
         assert run_command(viewer.main, [*argv, *wrong, "--out", str(run / "x.html")]) == 2
     assert run_command(viewer.main, [str(run), "--time", "3"]) == 2
-
-
-def test_a_colony_begins_before_its_first_checkpoint(tmp_path):
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(SETTINGS))
-    _, _, search, begin = open_colony(tmp_path, 1.0)
-    assert begin == 1.0 and not search.members and search.generation == 0
-    with pytest.raises(InputError, match="expected a checkpoint that is whole; found none"):
-        open_colony(tmp_path)
 
 
 def test_other_runs_have_no_colony(tmp_path):

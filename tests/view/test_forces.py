@@ -1,28 +1,21 @@
 """Forces on parts: closed forms, and the sum that the engines' step makes of them."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
-
 import mujoco
 import numpy as np
 import pytest
 
 from laboratory import (
-    WATER,
     accelerate,
     arm_robot,
-    body,
     box_robot,
     face_drag,
     random_states,
     world,
 )
 from mjx_revolve.body.module_types import Thruster
-from mjx_revolve.engine.robot import Robot, build_robot
+from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.simulate import Trajectory
-from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.forces import Forces, module_forces, sum_modules
+from mjx_revolve.view.forces import module_forces
 from mjx_revolve.water.flow import Water, flow, water_of
 from mjx_revolve.water.plates import LiftDrag
 
@@ -47,58 +40,8 @@ def states(robot: Robot, qpos, qvel=None, ctrl=None, command=None, time=None) ->
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """How parts are placed and move, world frame.
-
-    Attributes:
-        place: `[S, npart, 3]` centres of their boxes [m].
-        turn: `[S, npart, 3, 3]` world from part.
-        velocity: `[S, npart, 3]` of the centres [m/s].
-        spin: `[S, npart, 3]` angular velocity [rad/s].
-    """
-
-    place: np.ndarray
-    turn: np.ndarray
-    velocity: np.ndarray
-    spin: np.ndarray
-
-
-def part_motion(robot: Robot, qpos: np.ndarray, qvel: np.ndarray) -> Motion:
-    """Where a robot's parts are and how they move, by MuJoCo's own kinematics.
-
-    Args:
-        robot: from `build_robot`.
-        qpos: `[S, nq]`.
-        qvel: `[S, nv]`.
-
-    Returns:
-        Of the parts, in the order of the fluid table.
-    """
-    model, table = robot.mj_model, robot.fluid
-    data, body = mujoco.MjData(model), table.body
-    place, turn, velocity, spin = [], [], [], []
-    for q, v in zip(np.asarray(qpos, float), np.asarray(qvel, float), strict=True):
-        data.qpos[:], data.qvel[:] = q, v
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_comVel(model, data)
-        frame = data.xmat.reshape(-1, 3, 3)[body]
-        at = data.xpos[body] + np.einsum("pij,pj->pi", frame, table.position)
-        # MuJoCo gives velocities at the centre of mass of the whole robot.
-        arm = at - data.subtree_com[1]
-        place.append(at)
-        turn.append(frame @ table.rotation)
-        velocity.append(data.cvel[body, 3:] + np.cross(data.cvel[body, :3], arm))
-        spin.append(data.cvel[body, :3])
-    return Motion(*(np.array(x) for x in (place, turn, velocity, spin)))
-
-
 def pose(x=0.0, y=0.0, z=-5.0, quat=(1.0, 0.0, 0.0, 0.0)) -> np.ndarray:
     return np.array([x, y, z, *quat])
-
-
-# ------------------------------------------------------------------------- closed forms
 
 
 def test_buoyancy_of_what_is_under_water():
@@ -110,21 +53,6 @@ def test_buoyancy_of_what_is_under_water():
     assert forces.buoyancy[:, 0, 2] == pytest.approx([full, full, 0, full / 2], rel=1e-5)
     assert forces.buoyancy[:, 0, :2] == pytest.approx(0, abs=1e-6 * full)
     assert not forces.drag.any() and not forces.thrust.any()
-
-
-@pytest.mark.slow
-def test_buoyancy_of_each_module():
-    """Modules under water are held up by ρ V g each, hinge and all."""
-    robot = build_robot(body("spider"), world(**WATER))
-    forces = module_forces(robot, states(robot, robot.start_qpos(3.0)))
-    expected = [RHO * module.kind.volume * G for module in robot.morphology.modules]
-    assert sum_modules(robot, forces.buoyancy)[0, :, 2] == pytest.approx(expected, rel=1e-5)
-    assert forces.buoyancy.sum(1)[0, 2] == pytest.approx(RHO * robot.morphology.volume * G)
-    assert forces.place[0] == pytest.approx(part_motion(robot, *_start(robot)).place[0])
-
-
-def _start(robot: Robot):
-    return robot.start_qpos(3.0)[None], np.zeros((1, robot.mj_model.nv))
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -171,23 +99,6 @@ def test_thrust_follows_the_curve():
     assert asked.thrust[0, 0] == pytest.approx([0, 0.8 * 0.25, 0])
 
 
-def test_thrust_of_the_auv():
-    """Each thruster by its own curve, at its own module, along its own axis."""
-    robot = build_robot(body("auv"), world(**WATER))
-    command = np.array([[0.3, -0.6, 0.9, 0.4]])
-    forces = module_forces(robot, states(robot, robot.start_qpos(2.0), command=command))
-    for k, (row, part) in enumerate(zip(robot.thruster_row, robot.thruster_part, strict=True)):
-        size = part.thruster.thrust_at(command[0, k])
-        assert np.linalg.norm(forces.thrust[0, row]) == pytest.approx(abs(size), rel=1e-5)
-        axis = robot.fluid.rotation[row] @ part.thruster.axis
-        assert forces.thrust[0, row] == pytest.approx(size * axis, abs=1e-6)
-    others = np.setdiff1d(np.arange(len(robot.fluid.body)), robot.thruster_row)
-    assert not forces.thrust[0, others].any()
-
-
-# ------------------------------------------------------------------------- moving water
-
-
 def test_water_of_its_time():
     """Waves go on with time, a current's rows with the steps: drag sees the water of the moment."""
     sea = world(drag="faces", gravity=G, waves=[{"amplitude": 0.05, "wavelength": 2.0}])
@@ -215,8 +126,6 @@ def test_a_current_that_speeds_up_pushes():
     force = module_forces(robot, states(robot, pose()), water=water).buoyancy[0, 0]
     assert force == pytest.approx(RHO * np.prod(BRICK) * np.array([0.5, 0, G - 1]), rel=1e-5)
 
-
-# ------------------------------------------------------------------------- the step's sum
 
 _SEA = {
     "current": (0.2, -0.1, 0.0),
@@ -268,29 +177,3 @@ def test_sum_is_what_the_step_does(laws):
         for q, v, a in zip(qpos.T, qvel.T, acceleration.T, strict=True)
     ]
     assert total == pytest.approx(np.array(expected), rel=1e-3, abs=2e-4)
-
-
-# ------------------------------------------------------------------------- rows and mistakes
-
-
-def test_rows():
-    """Every so many rows, from the first."""
-    robot = box_robot(BRICK, 0.03, world(gravity=G, buoyancy="partial"))
-    forces = module_forces(robot, states(robot, [pose()] * 7, time=0.1 * np.arange(7)), 3)
-    assert isinstance(forces, Forces)
-    assert forces.rows.tolist() == [0, 3, 6]
-    assert forces.time == pytest.approx([0, 0.3, 0.6])
-    assert forces.drag.shape == forces.place.shape == (3, 1, 3)
-
-
-@pytest.mark.parametrize("every", [0, -1, 1.5, True])
-def test_every_is_checked(every):
-    robot = box_robot(BRICK, 0.03, world())
-    with pytest.raises(InputError, match=r"^every: expected a whole number of at least 1; found"):
-        module_forces(robot, states(robot, pose()), every)
-
-
-def test_another_robots_trajectory():
-    robot, other = box_robot(BRICK, 0.03, world()), arm_robot(world())
-    with pytest.raises(InputError, match=r"^trajectory.qpos: expected \[1, 7\]; found \[1, 11\]$"):
-        module_forces(robot, states(other, other.qpos0))

@@ -1,22 +1,17 @@
 """Films: what they show and when, how they are drawn and written, and the command."""
 
-from __future__ import annotations
-
 import io
 import math
-import os
 from dataclasses import replace
 from functools import lru_cache
-from types import SimpleNamespace
 
 import av
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 from PIL import Image
 
-from laboratory import ROOT, WATER, body, world
+from laboratory import body
 from mjx_revolve import replay
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.champion import Episode
@@ -28,10 +23,9 @@ from mjx_revolve.view.film import opengl, overlay
 from mjx_revolve.view.film.camera import FOVY, plan_circle, plan_shots
 from mjx_revolve.view.film.draw import draw_frames, draw_shaded
 from mjx_revolve.view.film.film import make_colony_film, make_film
-from mjx_revolve.view.film.stage import BACKGROUND, build_stage, make_sand
+from mjx_revolve.view.film.stage import BACKGROUND, build_stage
 from mjx_revolve.view.film.video import gif_stride, make_gif, write_mp4
-from mjx_revolve.view.film.waterlight import daylight, make_shader, open_water, transmission
-from mjx_revolve.view.pieces import smooth_mesh
+from mjx_revolve.view.film.waterlight import make_shader
 from mjx_revolve.view.recording import Mark, Recording, ReplayRobot
 from mjx_revolve.view.swim_picture import pose_scenes
 from mjx_revolve.water.flow import Water
@@ -39,9 +33,6 @@ from mjx_revolve.water.world import load_world
 
 STEP = 0.005
 SIZE = (160, 120)
-
-
-# --- an episode without a simulation ------------------------------------------------------------
 
 
 def swim(robot, seconds=1.0, velocity=(0.2, 0.1, 0.0), depth=1.0):
@@ -78,9 +69,6 @@ def frames(episode, way):
     return film, list(draw_frames(film, way))
 
 
-# --- the camera ---------------------------------------------------------------------------------
-
-
 def plan(path, radius=0.2, surface=0.0, bed=None, aspect=4 / 3, **kw):
     time = np.arange(len(path)) / 30
     size = np.full(len(path), radius)
@@ -98,8 +86,8 @@ def assert_in_frame(shots, path, radius, aspect=4 / 3):
         assert (z * up - abs(y)) / math.hypot(1, up) > radius
 
 
-@pytest.mark.parametrize("aspect", [4 / 3, 16 / 9, 0.5])
-@pytest.mark.parametrize("heading", [0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
+@pytest.mark.parametrize("aspect", [4 / 3, 0.5])
+@pytest.mark.parametrize("heading", [0.0, 2.0, 5.0])
 def test_robot_stays_in_frame_and_swims_to_the_right(heading, aspect):
     time = np.arange(150)[:, None] / 30
     ahead = np.array([math.cos(heading), math.sin(heading), 0.0])
@@ -122,14 +110,6 @@ def test_robot_stays_in_frame_whatever_it_does(velocity):
     assert_in_frame(shots, path, 0.2)
 
 
-def test_camera_does_not_shake_with_the_strokes():
-    time = np.arange(300)[:, None] / 30
-    path = [0, 0, -2] + time * [0.1, 0, 0] + 0.05 * np.sin(2 * np.pi * 1.5 * time) * [0, 0, 1]
-    shots = plan(path)
-    assert np.ptp(shots.target[60:-60, 2]) < 0.002
-    assert np.diff(shots.position[:, 0]) == pytest.approx(0.1 / 30, rel=0.02)
-
-
 def test_camera_goes_round_a_dune_and_under_the_surface():
     def bed(x, y):
         return -1.0 + 0.8 * np.exp(-((x - 0.3) ** 2 + (y + 1.0) ** 2) / 0.1)
@@ -149,26 +129,6 @@ def test_what_floats_is_filmed_from_the_air():
     assert shots.above
     assert (shots.position[:, 2] > 0.1).all()
     assert_in_frame(shots, path, 0.2)
-
-
-def test_who_stays_is_seen_from_its_side():
-    shots = plan([[0, 0, -2.0]] * 30, along=(0.0, 1.0))
-    assert shots.axes(0)[0] @ [0, 1, 0] > 0.8
-
-
-def test_one_frame_is_a_film_too():
-    assert_in_frame(plan([[1.0, 2.0, -3.0]]), [[1.0, 2.0, -3.0]], 0.2)
-
-
-def test_projection_of_a_known_point():
-    shots = plan([[0.0, 0.0, -2.0]] * 2)
-    flat, away = shots.project(0, np.array([shots.target[0], 2 * shots.position[0]
-                                            - shots.target[0]]))  # fmt: skip
-    assert flat[0] == pytest.approx([0, 0], abs=1e-9)
-    assert away[1] == pytest.approx(-away[0])
-
-
-# --- the stage ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["spider", "auv", "fish"])
@@ -209,61 +169,6 @@ def test_stage_stands_as_the_robot_does(name):
         assert near.max() < 1e-5
 
 
-@pytest.mark.slow
-def test_stage_counts_from_its_origin(spider):
-    world = load_world("lake", bed={"kind": "flat", "height": -12.0})
-    model = build_stage({0: spider}, world, origin=(380.0, 20.0, -10.0), sight=5.0)
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    assert data.geom_xpos[model.geom("sand").id] == pytest.approx([0, 0, -2], abs=0.01)
-
-
-def test_a_world_without_a_bed_has_none(spider):
-    model = build_stage({0: spider}, load_world("lake", bed="off"))
-    names = [model.geom(k).name for k in range(model.ngeom)]
-    assert "sand" not in names and "0/bed" not in names
-
-
-def test_normals_are_sharp_on_a_cube_and_smooth_on_a_pipe():
-    import trimesh
-
-    cube = smooth_mesh(np.asarray(trimesh.creation.box((1, 1, 1)).triangles))
-    expected = np.repeat(cube.face_normals[:, None], 3, 1)
-    assert cube.vertex_normals[cube.faces] == pytest.approx(expected, abs=1e-9)
-    assert len(cube.faces) == 12 and cube.area == pytest.approx(6)
-    pipe = smooth_mesh(np.asarray(trimesh.creation.cylinder(1.0, 2.0, sections=32).triangles))
-    side = np.abs(pipe.face_normals[:, 2]) < 0.5
-    assert side.sum() == 64
-    outward = pipe.triangles[side] * [1, 1, 0]
-    assert (pipe.vertex_normals[pipe.faces][side] * outward).sum(-1) == pytest.approx(1, abs=0.01)
-
-
-def test_sand_can_be_laid_side_by_side():
-    sand = make_sand(128).astype(float)
-    inside = np.abs(np.diff(sand, axis=0)).mean()
-    assert np.abs(sand[0] - sand[-1]).mean() < 2 * inside
-    assert sand.std() > 3
-
-
-# --- the water's light --------------------------------------------------------------------------
-
-
-def test_water_takes_red_first():
-    clear = np.asarray(transmission(0.0, 1.0))
-    assert clear == pytest.approx([1, 1, 1])
-    near, far = (np.asarray(transmission(x, 1.0)) for x in (1.0, 8.0))
-    assert (near > 0.75).all() and (far < 0.4).all()
-    assert far[0] < far[1] < far[2]
-    # Small robots are seen as clearly as large ones.
-    assert np.asarray(transmission(3.0, 3.0)) == pytest.approx(near, rel=1e-6)
-
-
-def test_light_comes_from_above():
-    assert np.asarray(daylight(0.0)) == pytest.approx([1, 1, 1])
-    assert (np.diff(np.asarray(daylight(np.array([1.0, 10.0, 100.0]))), axis=0) < 0).all()
-    assert (np.diff(np.asarray(open_water(np.linspace(-1, 1, 9))), axis=0) > 0).all()
-
-
 @lru_cache
 def shader_of(world, above):
     return make_shader(world, (32, 24), 1.0, above)
@@ -281,21 +186,6 @@ def shade(world, above, depth, color=(200, 60, 40), height=1.0, pitch=0.0, time=
     return np.asarray(shader(picture, depths, place, axes, water))
 
 
-def test_what_is_far_is_lost_in_blue_haze():
-    world = load_world("lake")
-    near, far = (shade(world, False, d, height=-5.0).reshape(-1, 3).mean(0) for d in (1.0, 30.0))
-    assert near[0] > near[2]
-    assert far[2] > 2 * far[0]
-
-
-def test_looking_up_shows_the_surface_and_looking_down_none():
-    world = load_world("lake")
-    plain = tuple(round(255 * c) for c in BACKGROUND)
-    up = shade(world, False, np.inf, plain, height=-0.5, pitch=1.2)
-    down = shade(world, False, np.inf, plain, height=-0.5, pitch=-1.2)
-    assert up.mean() > 150 > 90 > down.mean()
-
-
 def test_waves_move_the_surface_in_time():
     calm = load_world("lake")
     rough = load_world("lake", waves=[{"amplitude": 0.05, "wavelength": 1.0}])
@@ -306,18 +196,6 @@ def test_waves_move_the_surface_in_time():
     assert np.abs(first - shade(calm, False, np.inf, **look).astype(int)).max() > 20
 
 
-def test_from_the_air_what_is_deep_is_dimmer():
-    world = load_world("lake")
-    look = {"height": 1.0, "pitch": -1.2}
-    dry, shallow, deep = (shade(world, True, d, **look).astype(int) for d in (0.8, 1.3, 4.0))
-    assert dry[12, 16] == pytest.approx([200, 60, 40], abs=4)
-    assert dry[..., 0].mean() > shallow[..., 0].mean() > deep[..., 0].mean() + 20
-    assert deep[..., 2].mean() > deep[..., 0].mean()
-
-
-# --- films --------------------------------------------------------------------------------------
-
-
 def test_frames_are_evenly_spaced_and_between_the_rows(episode):
     film = make_film(episode, SIZE, 30)
     assert len(film.time) == 30
@@ -325,32 +203,6 @@ def test_frames_are_evenly_spaced_and_between_the_rows(episode):
     assert film.robots[0].qpos[15, 0] == pytest.approx(0.2 * film.time[15], abs=1e-9)
     assert film.notes.speed == pytest.approx(math.hypot(0.2, 0.1), rel=0.05)
     assert film.lost is None
-
-
-def test_a_turn_over_the_sign_of_the_quaternion_is_a_small_one(spider):
-    episode = swim(spider)
-    qpos = np.array(episode.trajectory.qpos)
-    qpos[1::2, 3:7] *= -1
-    film = make_film(replace(episode, trajectory=replace(episode.trajectory, qpos=qpos)), SIZE, 77)
-    assert np.abs(film.robots[0].qpos[:, 3]) == pytest.approx(1.0)
-
-
-def test_motes_drift_with_the_current_and_its_gusts(spider):
-    robot = build_robot(spider.morphology, load_world("lake", current=(0.1, 0, 0)))
-    film = make_film(swim(robot), SIZE, 10)
-    assert np.stack(film.water.current) == pytest.approx(np.tile([[0.1], [0], [0]], 10))
-    steps = np.arange(200)
-    gusty = Water(0.0, (0.1 + STEP * steps, 0.0 * steps, 0.0 * steps))
-    film = make_film(replace(swim(robot), water=gusty), SIZE, 10)
-    assert film.water.current[0] == pytest.approx(0.1 + film.time)
-
-
-def test_balls_hold_every_part(spider):
-    film = make_film(swim(spider), SIZE, 10)
-    for k in (0, 7):
-        scene = pose_scenes(spider, film.robots[0].qpos[k, None])[0]
-        away = np.linalg.norm(scene.corners - film.center[k], axis=-1)
-        assert away.max() < film.notes.radius[k] < 1.3 * away.max()
 
 
 def test_a_trajectory_that_fails_is_shown_up_to_there(spider):
@@ -382,26 +234,6 @@ def test_frames_show_the_robot_in_its_colours_in_blue_water(frames):
         rows, columns = np.nonzero(salmon[18:100])
         assert rows.min() > 3 and columns.min() > 5 and columns.max() < 155
     assert np.abs(drawn[0].astype(int) - drawn[9]).max() > 50
-
-
-@pytest.mark.slow
-def test_light_falls_from_above_in_a_film(frames):
-    _, drawn = frames
-    assert drawn[0][20:40].mean() > drawn[0][90:105].mean() + 10
-
-
-@pytest.mark.slow
-def test_the_bed_shows_where_it_is_near(spider, way):
-    world = load_world("lake", bed={"kind": "flat", "height": -1.3})
-    robot = build_robot(spider.morphology, world)
-    film = make_film(swim(robot, 0.1, depth=1.1), SIZE, 10)
-    assert film.shots.position[0, 2] > -1.3
-    frame = next(iter(draw_frames(film, way)))
-    low = frame[95:110, 60:].reshape(-1, 3).mean(0)
-    assert low[0] > 80  # sand is no water
-
-
-# --- files --------------------------------------------------------------------------------------
 
 
 def moving_dot(count=30, size=SIZE):
@@ -444,60 +276,6 @@ def test_gif_reads_back_with_the_film_s_time_and_colours():
             np.abs(np.asarray(gif.convert("RGB"), int)[60, 10 * k + 10] - (220, 60, 40)).max() < 8
         )
     assert total == 1000
-
-
-@pytest.mark.long
-def test_long_and_noisy_gifs_get_smaller():
-    random = np.random.default_rng(0)
-    every = gif_stride(30, 6000)
-    assert 6000 / every <= 160
-    shown = [Image.fromarray(random.integers(0, 255, (240, 320, 3), np.uint8)) for _ in range(4)]
-    content = make_gif(shown, every / 30, limit=100_000)
-    assert 30_000 < len(content) < 100_000
-    with Image.open(io.BytesIO(content)) as gif:
-        assert gif.n_frames == 4 and gif.width * 3 == pytest.approx(gif.height * 4, abs=4)
-
-
-def test_current_and_target_are_shown():
-    """An arrow and a number in the corner; a ring on the target, or an arrow at the edge."""
-    robot = build_robot(body("core"), world(**WATER, current=(0.0, 0.1, 0.0)))
-    time = 0.02 * np.arange(1, 51)
-    qpos = np.tile(robot.start_qpos(), (50, 1))
-    still = np.zeros((50, 0))
-    rows = Trajectory(time, qpos, np.zeros((50, 6)), np.zeros((50, 2, 3)), still, 0 * time)
-
-    def signs(frame, target=None, rows=rows):
-        """Words in a frame, their places, and how many pixels are pink."""
-        fitness = SimpleNamespace(config=SimpleNamespace(task=SimpleNamespace(target=target)))
-        film = make_film(Episode("core", robot, rows, fitness=fitness), (320, 240), 10)
-        blank, words = np.zeros((240, 320, 3), np.uint8), []
-        with pytest.MonkeyPatch.context() as patch:
-            write = overlay.Pen.write
-            patch.setattr(
-                overlay.Pen, "write", lambda *a, **k: words.append(a[1:4]) or write(*a, **k)
-            )
-            drawn = overlay.make_overlay(film)(blank, np.full((240, 320), np.inf), frame)
-        said = {text: (x, y) for x, y, text in words if "current" in text or "target" in text}
-        return said, int((np.abs(drawn.astype(int) - overlay.AIM[:3]).max(-1) < 40).sum())
-
-    assert [*signs(3)[0]] == ["current 0.10 m/s"]
-    x, y, z = qpos[0, :3]
-    said, pixels = signs(3, (x, y, z + 0.05))
-    assert [*said] == ["current 0.10 m/s", "target, 0.05 m"] and pixels > 30
-    at = said["target, 0.05 m"]
-    assert 100 < at[0] < 220 and 40 < at[1] < 180  # not far from the robot
-    said, pixels = signs(3, (x + 5.0, y, z))
-    assert "target, 5 m" in said and pixels > 30
-    # One that moves is where the trajectory has it: 2 m away at the start, and 1 m nearer a second
-    # on.
-    way = qpos[:, :3] + np.array([1.0, 0, 0]) * (2 - time[:, None])
-    moving = replace(rows, target=way)
-    assert (
-        "target, 1.8 m" in signs(2, rows=moving)[0] and "target, 1.1 m" in signs(9, rows=moving)[0]
-    )
-
-
-# --- colonies -----------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -555,20 +333,8 @@ def test_the_camera_circles_and_sees_most(depth, above):
         assert inside.mean() >= 0.75
 
 
-def test_the_camera_stays_where_no_robot_is_left():
-    alive = np.zeros((1, 20), bool)
-    alive[0, :5] = True
-    places = np.ones((1, 20, 3)) * (1.0, 2.0, -1.0)
-    shots = plan_circle(np.arange(20) / 10, places, alive, reach=0.2, aspect=1.0, surface=10.0)
-    assert np.isfinite(shots.position).all()
-    assert np.linalg.norm(shots.position - (1.0, 2.0, -1.0), axis=1) == pytest.approx(
-        np.full(20, shots.distance)
-    )
-
-
 @pytest.mark.slow
 def test_the_dead_are_not_drawn(colony, way):
-    """Something is as far away as a robot, where it is in the frame, while it is alive."""
     film, seen = make_colony_film(colony, SIZE, 1), 0
     for picture, depth, frame in draw_shaded(film, way):
         assert picture.shape == (120, 160, 3)
@@ -586,24 +352,8 @@ def test_the_dead_are_not_drawn(colony, way):
     assert film.robots[2].alive.tolist() == [False, True, False]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ([str(ROOT / "morphologies" / "fish.yaml"), "--colony"], "run folder of a colony"),
-        (["run", "--colony", "--html"], "--colony: expected neither --html nor --ancestors"),
-        (["run", "--colony", "--out", "a.html"], "ends in .mp4 or .gif, with a film of several"),
-        ([str(ROOT / "morphologies" / "fish.yaml"), "--time", "3"], "--time: expected --colony"),
-        ([str(ROOT), "--colony", "--seed", "1"], "--seed: expected none with --colony"),
-    ],
-)
-def test_what_is_no_film_of_a_colony(arguments, words, capsys):
-    assert run_command(replay.main, arguments) == 2
-    assert words in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_the_command_films_a_colony(colony, way, tmp_path, monkeypatch, capsys):
-    """Its recording is that of the page, see `test_colony_pictures`."""
     asked = []
     monkeypatch.setattr(
         "mjx_revolve.view.colony.record_colony", lambda *given: asked.append(given) or colony
@@ -620,9 +370,6 @@ def test_the_command_films_a_colony(colony, way, tmp_path, monkeypatch, capsys):
         stream = file.streams.video[0]
         assert sum(1 for _ in file.decode(stream)) == 15
         assert (stream.width, stream.height) == SIZE
-
-
-# --- the command --------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -678,46 +425,10 @@ def test_page_alone_needs_no_opengl(command, tmp_path, monkeypatch):
     assert (tmp_path / "page.html").exists()
 
 
-def test_no_opengl_is_one_line_that_says_what_to_install(command, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(opengl, "_works", lambda way: False)
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
-    (tmp_path / "genes.yaml").touch()
-    assert command(str(tmp_path / "genes.yaml"), "--out", str(tmp_path / "x.mp4")) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: OpenGL: expected") and error.count("\n") == 1
-    if os.sys.platform.startswith("linux"):
-        assert "apt-get install libegl1 libgl1-mesa-dri" in error
-
-
-def test_the_user_s_opengl_is_the_only_one_tried(monkeypatch):
-    tried = []
-    monkeypatch.setattr(opengl, "_works", lambda way: tried.append(way) or True)
-    monkeypatch.setattr(opengl.sys, "platform", "linux")
-    monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    assert opengl.find_opengl() == "osmesa" and tried == ["osmesa"]
-    monkeypatch.setenv("MUJOCO_GL", "vulkan")
-    with pytest.raises(InputError, match="MUJOCO_GL: expected one of egl, osmesa, glfw; found"):
-        opengl.find_opengl()
-    monkeypatch.setenv("MUJOCO_GL", "off")
-    with pytest.raises(InputError, match="switched off"):
-        opengl.find_opengl()
-    monkeypatch.delenv("MUJOCO_GL")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.setattr(opengl, "_works", lambda way: tried.append(way) or way == "glfw")
-    with pytest.raises(InputError, match="expected one of egl, osmesa to draw with"):
-        opengl.find_opengl()
-    monkeypatch.setenv("DISPLAY", ":0")
-    assert opengl.find_opengl() == "glfw"
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--size", "640"), "--size: expected WIDTHxHEIGHT"),
         (("--size", "0x0"), "from 64x64 to 3840x2160; found '0x0'"),
-        (("--fps", "0"), "--fps: expected a whole number from 1 to 120; found '0'"),
-        (("--duration", "0"), "--duration: expected seconds > 0; found '0'"),
         (("--html", "--out", "x.mp4"), "with --html"),
     ],
 )
@@ -726,36 +437,3 @@ def test_wrong_options(words, message, tmp_path, capsys):
     assert run_command(replay.main, [str(tmp_path / "spider.yaml"), *words]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1 and error.startswith("error: ")
-
-
-def test_a_place_that_cannot_be_written(command, way, tmp_path, capsys):
-    source = tmp_path / "spider.yaml"
-    source.touch()
-    (tmp_path / "file").touch()
-    for name, message in (
-        ("file/x.mp4", "file/x.mp4: expected the folder"),
-        ("file/x", "file/x: expected the folder"),
-        ("file", "expected a folder, or a name that ends in .mp4, .gif, .html; found another file"),
-        ("x.avi", "expected a folder, or a name that ends in .mp4, .gif, .html; found '.avi'"),
-    ):
-        assert command(str(source), "--out", str(tmp_path / name)) == 2
-        error = capsys.readouterr().err
-        assert error.startswith("error: ") and error.count("\n") == 1 and message in error
-    assert command(str(source), "--html", "--out", str(tmp_path / "v0.2")) == 0
-    assert [path.name for path in (tmp_path / "v0.2").iterdir()] == ["viewer.html"]
-
-
-@pytest.mark.slow
-def test_a_lost_robot_is_named(episode, command, way, tmp_path, capsys, monkeypatch):
-    import mjx_revolve.episodes.champion
-
-    qpos = jnp.asarray(episode.trajectory.qpos).at[100:].set(jnp.nan)
-    lost = replace(episode, trajectory=replace(episode.trajectory, qpos=qpos))
-    monkeypatch.setattr(mjx_revolve.episodes.champion, "load_episode", lambda *a: lost)
-    source = tmp_path / "spider.yaml"
-    source.touch()
-    out = tmp_path / "x.gif"
-    assert command(str(source), "--size", "64x64", "--fps", "4", "--out", str(out)) == 0
-    assert "not finite from 0.505 s on" in capsys.readouterr().err
-    with Image.open(out) as gif:
-        assert gif.n_frames == 2

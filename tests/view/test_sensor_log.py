@@ -1,24 +1,17 @@
 """What a champion felt, over time: what its brain was told, and the picture of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import yaml
 
-from laboratory import elbow_robot, oar_robot, world
-from mjx_revolve import evolve, report
-from mjx_revolve.body.sensors import Sensor
+from laboratory import elbow_robot, world
 from mjx_revolve.control.controller import make_controller
 from mjx_revolve.episodes.config import make_config
 from mjx_revolve.episodes.fitness import make_fitness
-from mjx_revolve.view.plots import figure_svg
-from mjx_revolve.view.sensor_log import SensorTrace, trace_sensors
-from mjx_revolve.view.sensor_plots import plot_sensors
+from mjx_revolve.view.sensor_log import trace_sensors
 
 SENSORS = [
     {"type": "depth", "range": [0, 4], "noise": 0.05, "rate": 20, "delay": 0.06},
@@ -78,35 +71,6 @@ def seen(tmp_path_factory):
     return fitness, trajectory, trace_sensors(fitness, trajectory, KEY, trial=1)
 
 
-@pytest.mark.long
-def test_it_is_what_the_brain_was_told(seen):
-    """From the trajectory alone, with its noise, rates and delays; single precision apart."""
-    fitness, trajectory, felt = seen
-    observer, told = fitness.controller.observer, {}
-    for one in felt:
-        zero, scale = one.sensor.scaling
-        told[one.sensor.label] = scale * (one.given - zero)
-    robot, joint = 0.0, np.zeros((len(trajectory.time), 2))
-    names = iter(range(1, 99)), iter(range(1, 99))
-    for sensor in observer.sensors:
-        found = told.get(sensor.label)
-        for part in range(len(sensor.kind.parts)):
-            of_robot = next(names[0]) if sensor.where != "joint" else 0
-            of_joint = next(names[1]) if sensor.where != "robot" else 0
-            if found is None:  # there is no fin
-                continue
-            rows = found[:, part]
-            if sensor.where == "robot":
-                robot = robot + of_robot * rows[:, 0]
-            elif sensor.where == "joint" or sensor.each is not None:  # no brick is on the core
-                joint = joint + of_joint * rows
-            else:
-                robot, joint = robot + of_robot * rows[:, 0], joint + of_joint * rows[:, 1:]
-    expected = 0.3 * np.tanh((np.asarray(robot)[:, None] + joint) / 30)
-    assert trajectory.ctrl == pytest.approx(expected, abs=2e-5)
-    assert np.ptp(trajectory.ctrl, axis=0).min() > 0.05
-
-
 @pytest.mark.slow
 def test_what_is_true_is_the_trajectorys(seen):
     fitness, trajectory, felt = seen
@@ -126,62 +90,3 @@ def test_what_is_true_is_the_trajectorys(seen):
     assert [one.is_exact for one in felt] == [
         not {"noise", "rate", "delay"} & set(x) for x in SENSORS if x.get("each") != "Fin"
     ]
-
-
-def drawn(sensor, rows=("",), noise=0.0, steps=800):
-    """A sensor over time, made up."""
-    draw, parts = np.random.default_rng(0), len(sensor.kind.parts)
-    low, high = sensor.limits
-    wave = np.sin(0.03 * np.arange(steps)[:, None, None] + np.arange(len(rows)))
-    true = (low + high) / 2 + (high - low) * 0.7 * wave * np.ones((1, parts, 1))
-    told = np.clip(true + noise * draw.normal(size=true.shape), low, high)
-    return SensorTrace(sensor, rows, told, true)
-
-
-def test_the_picture_has_each_sensor_once():
-    legs = ("core", "hip", "knee")
-    felt = [
-        drawn(Sensor(type="depth", range=(0, 4), noise=0.1, rate=20, delay=0.06)),
-        drawn(Sensor(type="accelerometer", at="foot"), noise=9.0),
-        drawn(Sensor(type="speed"), legs[1:]),
-        drawn(Sensor(type="bearing")),
-        drawn(Sensor(type="flow", each="FixedBrick", noise=0.01), legs),
-        drawn(Sensor(type="touch", at="pad"), noise=0.1),
-    ]
-    time = 0.01 * np.arange(800)
-    figure = plot_sensors(time, felt)
-    titles = [axes.get_title(loc="left") for axes in figure.axes]
-    assert [x for x in titles if x] == [
-        "depth: noise 0.1 m, 20 Hz, 60 ms late", "foot accelerometer: exact", "bearing: exact",
-        "pad touch: exact", "speed: exact",
-        *(f"FixedBrick flow {x}: noise 0.01 m/s" for x in "xyz"),
-    ]  # fmt: skip
-    assert [axes.get_ylabel() for axes in figure.axes[:4]] == ["m", "m/s²", "", "N"]
-    legend = [axes.get_legend_handles_labels()[1] for axes in figure.axes[:4]]
-    assert legend == [["what was true"], ["x", "y", "z"], ["x", "y", "z"], ["left", "right"]]
-    # What is told, with its noise, is within the frame; what is true may be beyond.
-    for axes, one in zip(figure.axes, (felt[0], felt[1], felt[3], felt[5]), strict=False):
-        low, high = axes.get_ylim()
-        assert low < one.given.min() and one.given.max() < high
-    assert len(figure_svg(figure)) < 400_000
-    assert figure_svg(plot_sensors(time, felt[:1])) == figure_svg(plot_sensors(time, felt[:1]))
-    assert len(plot_sensors(time, [felt[2]]).axes) == 2  # strips alone, and their bar
-
-
-def test_brains_that_feel_nothing_declared_have_no_picture(tmp_path):
-    fitness = make_fitness(make_config(config(tmp_path, controller={"type": "cpg"})))
-    assert fitness.controller.observer is None
-    assert trace_sensors(fitness, None, KEY) == ()
-
-
-@pytest.mark.long
-def test_a_report_shows_what_was_felt(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    oar_robot(world()).morphology.save("elbow.yaml")
-    data = config(
-        tmp_path, controller={"type": "mlp", "hidden": 1, "messages": 0, "sensors": ["tilt"]}
-    )
-    (tmp_path / "swim.yaml").write_text(yaml.safe_dump(data))
-    assert evolve.main(["swim.yaml", "--out", "run"]) == 0
-    assert report.main(["run", "--out", "run.html"]) == 0
-    assert "Readings of each declared sensor" in (tmp_path / "run.html").read_text()

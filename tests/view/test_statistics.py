@@ -45,7 +45,6 @@ def test_columns_without_values_have_no_interval():
 
 
 def test_intervals_of_few_seeds_cover_what_they_promise():
-    """95 of 100 for normal values; the module's table has other distributions."""
     draw = np.random.default_rng(1).normal(size=(2000, 5))
     mean, half, _ = statistics.mean_and_half(draw.T)
     assert np.mean(np.abs(mean) <= half) == pytest.approx(0.95, abs=0.015)

@@ -1,25 +1,18 @@
 """Buoyancy: the cut box against exact geometry, and robots that fall, hover, float and bob."""
 
-from __future__ import annotations
-
 import itertools
 from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
-from laboratory import QUICK, accelerate, at_rest, body, box_robot, march, world
+from laboratory import accelerate, at_rest, body, box_robot, march, world
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import trim_neutral
-from mjx_revolve.engine.forces import part_forces
-from mjx_revolve.engine.population import init
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.engine.single_tree import make_single_tree
 from mjx_revolve.water.buoyancy import BUOYANCY_LAWS, buoyancy, cut_box
-from mjx_revolve.water.flow import water_of
 from references import clip_box
 
 WATER = 999.1026  # kg/m³, the thesis's
@@ -63,21 +56,6 @@ def attitudes(n, seed=0):
         rows = np.arange(k * n // 4, n // 2)
         up[rows, draw.integers(0, 3, len(rows))] *= 10 ** draw.uniform(-12, 0, len(rows))
     return up / np.linalg.norm(up, axis=1)[:, None]
-
-
-# ------------------------------------------------------------------------- the cut box
-
-
-def test_the_reference_itself_against_counting_points():
-    # 4e5 random points: the standard error of a share is below 0.0008.
-    draw = np.random.default_rng(3)
-    half = np.array([0.3, 0.7, 1.0])
-    points = draw.uniform(-1, 1, (400_000, 3)) * half
-    for up, depth in zip(attitudes(6), (-0.5, -0.1, 0.0, 0.1, 0.3, 0.6), strict=True):
-        wet = points @ up < depth
-        share, moment = clip_box(up, depth, half)
-        assert share == pytest.approx(wet.mean(), abs=0.004)
-        assert moment == pytest.approx((points * wet[:, None]).mean(0), abs=0.004)
 
 
 # Level, on edge and on corner, where the heights of edges vanish or are equal; signs too.
@@ -169,33 +147,6 @@ def test_force_moment_and_gradients_are_continuous_through_the_surface(name):
             fine = np.abs(np.diff(rows, axis=0)).max(0)
             coarse = np.abs(np.diff(rows[::2], axis=0)).max(0)
             assert np.all(fine < 0.7 * coarse + 1e-9), tilt
-
-
-def test_only_a_level_face_changes_the_slope_at_once_and_by_its_area():
-    """The one jump of geometry itself: ∂share/∂d of a level box is its waterplane or nothing.
-
-    Any tilt spreads it over the height by which the face is tilted.
-    """
-    half = np.array([0.3, 0.2, 0.1])
-    slope = jax.jit(
-        jax.vmap(jax.grad(lambda d, t: cut_box(tilted(t), d, tuple(half))[0]), (0, None))
-    )
-    just = 1e-9
-    with jax.enable_x64(True):
-        around = [-0.1 - just, -0.1 + just, 0.1 - just, 0.1 + just]
-        assert np.asarray(slope(np.array(around), 0.0)) == pytest.approx([0, 5, 5, 0], abs=1e-9)
-        # Flush: neither, but between both.
-        flush = np.asarray(slope(np.array([-0.1, 0.1]), 0.0))
-        assert np.all((flush >= 0) & (flush <= 5))
-        for tilt in (1e-6, 1e-4, 1e-2):
-            # At a corner the waterplane starts as a point: it grows with the square.
-            height = np.abs(np.array(tilted(tilt)) @ (half * [1, 1, 0]))
-            reach = height + 0.1 * np.cos(tilt)
-            depth = -reach + np.array([0.0, 1e-3, 2.0]) * height
-            found = np.asarray(slope(depth, tilt))
-            assert found[0] == pytest.approx(0.0, abs=1e-9)
-            assert 0 < found[1] < 1e-4
-            assert found[2] == pytest.approx(5 / np.cos(tilt), rel=1e-6)
 
 
 def potential(state, half):
@@ -295,70 +246,6 @@ def test_gradients_are_finite_everywhere(x64):
                 assert not np.any(by_up)
 
 
-def test_lanes_parts_and_vmap_agree():
-    """`[npart, nbody, lanes]` with a table of sizes, or one state at a time."""
-    draw = np.random.default_rng(4)
-    up = attitudes(24, 8).T.reshape(3, 2, 3, 4)
-    depth = draw.uniform(-0.1, 0.1, (2, 3, 4))
-    half = draw.uniform(0.02, 0.08, (3, 2, 3, 1))
-    with jax.enable_x64(True):
-        share, moment = jax.jit(lambda u, d: cut_box(tuple(u), d, tuple(half)))(up, depth)
-        flat = np.broadcast_to(half, up.shape).reshape(3, -1).T
-        one = jax.vmap(lambda u, d, h: cut_box(tuple(u), d, tuple(h)))
-        each, moments = one(up.reshape(3, -1).T, depth.ravel(), flat)
-    assert np.asarray(share).ravel() == pytest.approx(np.asarray(each), abs=1e-15)
-    assert np.stack(moment).reshape(3, -1) == pytest.approx(np.stack(moments), abs=1e-15)
-
-
-@pytest.mark.parametrize("name", ["cube", "TouchSensor-sensor"])
-def test_force_and_moment_come_from_one_potential(name):
-    """∂share/∂n = -∂moment/∂d and ∂moment_i/∂n_j = ∂moment_j/∂n_i: nothing to gain in a cycle."""
-    half, n = BOXES[name], 60
-    up = attitudes(n, 5)
-    depth = np.random.default_rng(2).uniform(-0.9, 0.9, n) * (np.abs(up) @ half)
-
-    def first(state):
-        share, moment = cut_box((state[1], state[2], state[3]), state[0], tuple(half))
-        return jnp.stack([share, *(-m for m in moment)])
-
-    with jax.enable_x64(True):
-        second = np.asarray(jax.jit(jax.vmap(jax.jacfwd(first)))(np.column_stack([depth, up])))
-    # Rounding only, at attitudes as near to level as the generator makes them.
-    scale = np.abs(second).max((1, 2))[:, None, None]
-    assert np.all(np.abs(second - second.transpose(0, 2, 1)) < 1e-7 * scale)
-
-
-def test_level_draft_is_exact():
-    # A level box is under water by what its draft says, to rounding.
-    half = np.array([0.3, 0.2, 0.1])
-    depth = np.linspace(-0.07, 0.07, 15)
-    share, moment = cut(np.tile([0.0, 0.0, 1.0], (15, 1)), depth, half)
-    assert share == pytest.approx(0.5 + depth / 0.2, abs=1e-12)
-    assert moment[:, :2] == pytest.approx(0.0, abs=1e-15)
-
-
-@pytest.mark.parametrize("half", [(0.0445, 0.0445, 0.0225), (0.1, 0.05, 0.02), (0.2, 0.3, 0.3)])
-@pytest.mark.parametrize("angle", [1e-3, 0.02, 0.1])
-def test_righting_moment_of_a_level_box(half, angle):
-    """The wall-sided formula, exact until an edge dips in.
-
-    y_B = BM tan φ, z_B = KB + ½ BM tan² φ.
-    """
-    half, depth = np.array(half), 0.1 * half[2]
-    draft = half[2] + depth
-    metacentric = (2 * half[1]) ** 2 / (12 * draft)
-    center = [
-        0.0,
-        -metacentric * np.tan(angle),
-        draft / 2 - half[2] + metacentric * np.tan(angle) ** 2 / 2,
-    ]
-    up = np.array([0.0, np.sin(angle), np.cos(angle)])
-    share, moment = cut(up[None], [depth * np.cos(angle)], half)
-    assert share[0] == pytest.approx(draft / (2 * half[2]), rel=1e-12)
-    torque, exact = np.cross(moment[0] / share[0], up)[0], np.cross(center, up)[0]
-    assert torque == pytest.approx(exact, rel=1e-9)
-
-
 def test_archimedes_and_the_lever_of_the_centre_of_volume():
     up = (0.0, 0.6, 0.8)
     force, torque = buoyancy(up, 0.5, (0.0, 0.0, -0.01), 2e-4, (0.003, 0.0, 0.01), WATER * G)
@@ -366,12 +253,6 @@ def test_archimedes_and_the_lever_of_the_centre_of_volume():
     assert np.array(force, float) == pytest.approx(lift * np.array(up))
     arm = np.array([0.003, 0.0, 0.01]) + np.array([0.0, 0.0, -0.01]) / 0.5
     assert np.array(torque, float) == pytest.approx(np.cross(arm, lift * np.array(up)))
-
-
-# ------------------------------------------------------------------------- falling
-
-
-# ------------------------------------------------------------------------- hovering and floating
 
 
 @pytest.mark.slow
@@ -404,39 +285,3 @@ def test_a_box_is_cut_where_it_is_wherever_its_volume_has_its_centre():
     assert -found[3] == pytest.approx(torque / (mass * size**2 / 6), abs=1e-9)
     found = accelerate(box(world(gravity=G, buoyancy="mask")), qpos, np.zeros((6, 5)))
     assert found[2, 3:] == pytest.approx([-G, G], abs=1e-12)
-
-
-def part_buoyancy(robot, qpos, qvel):
-    """`[lanes, npart, 3]` buoyancy of each part, world frame."""
-    with jax.enable_x64(True):
-        levels = make_single_tree(robot)
-        state = init(levels, jnp.asarray(qpos), jnp.asarray(qvel))
-        thrusts = jnp.zeros((robot.num_thrusters, qpos.shape[1]))
-        run = jax.jit(partial(part_forces, levels), compiler_options=QUICK)
-        return np.asarray(run(state, water_of(robot.world), thrusts)[0])
-
-
-@pytest.mark.slow
-def test_the_shipped_auv_is_cut_where_its_core_is():
-    """Its ballast's volume puts the core's centre of volume 4.7 mm off the box's.
-
-    Half its core's box is under water where the core's centre is, at any attitude about it.
-    """
-    robot = build_robot(body("auv"), world(gravity=G, buoyancy="partial"))
-    fluid = robot.fluid
-    core = int(fluid.volume.argmax())
-    off = np.linalg.norm(fluid.center_of_volume[core])
-    assert off > 2e-3
-    quat = np.random.default_rng(4).normal(size=(4, 8))
-    qpos, qvel = at_rest(robot, 8)
-    qpos[3:7] = quat / np.linalg.norm(quat, axis=0)
-    data, forces = mujoco.MjData(robot.mj_model), part_buoyancy(robot, qpos, qvel)
-    for lane in range(8):
-        data.qpos[:] = qpos[:, lane]
-        mujoco.mj_kinematics(robot.mj_model, data)
-        for p, whole in enumerate(WATER * G * fluid.volume):
-            turn = data.xmat[fluid.body[p]].reshape(3, 3)
-            depth = -(data.xpos[fluid.body[p]] + turn @ fluid.position[p])[2]
-            up = (turn @ fluid.rotation[p])[2]
-            share, _ = clip_box(up, depth, fluid.half_size[p])
-            assert forces[lane, p] == pytest.approx([0, 0, share * whole], abs=1e-9)

@@ -1,7 +1,5 @@
 """The water against closed forms, through the engine: the cases of `experiments.validation`."""
 
-from __future__ import annotations
-
 import pytest
 
 from experiments.validation_cases import CASES, QUICK_CASES

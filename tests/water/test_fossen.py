@@ -1,7 +1,5 @@
 """Added mass and damping that modules state themselves, and coefficients per axis."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,8 +13,6 @@ from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.population import acceleration
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.formats.mjcf import make_mjcf
-from mjx_revolve.formats.sdf import make_sdf
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.flow import water_of
 
@@ -130,21 +126,6 @@ def test_coefficients_may_differ_from_axis_to_axis():
     assert given.modules[0].kind.parts[0].drag_coefficient == (1.0, 2.0, 3.0)
 
 
-@pytest.mark.parametrize(
-    "params, text",
-    [
-        ("drag_coefficient: [1, 2]", "a number >= 0, or three, one for each axis; found .1, 2"),
-        ("fossen: {added_mass: [1, 2]}", "expected six numbers, or six rows of six"),
-        ("fossen: {added_mass: [1, 1, 1, 1, 1, -1]}", "a matrix without negative eigenvalues"),
-        ("fossen: {quadratic_damping: 3}", "six numbers >= 0"),
-        ("fossen: {damping: 3}", "damping"),
-    ],
-)
-def test_what_is_no_such_matrix_is_refused(params, text):
-    with pytest.raises(InputError, match=text):
-        read(f"body: {{type: Core, params: {{{params}}}}}")
-
-
 def test_where_they_may_stand():
     whole = "body: {type: Core, params: {fossen: {whole: true}}, children: {1: {type: %s}}}"
     body = read(whole % "FixedBrick")
@@ -193,13 +174,6 @@ def test_different_bodies_side_by_side_and_gradients():
         assert np.asarray(found)[:6, k] == pytest.approx(alone[:, 0], rel=1e-9)
     # A chunk without such parts has the same tables.
     pack_bodies(robots[1:2], capacity)
-
-
-def test_files_for_other_programs_say_what_they_can(stated):
-    sdf = make_sdf(stated)
-    assert "<xU>-1</xU>" in sdf and "<xUabsU>-3</xUabsU>" in sdf and "<yP>-0.02</yP>" in sdf
-    assert "<xq>0.05</xq>" in sdf and "<yr>-0.06</yr>" in sdf and "<qq>0.03</qq>" in sdf
-    assert "stated damping (fossen)" in " ".join(make_mjcf(stated).split())
 
 
 def test_a_bluerov2_is_the_published_one():

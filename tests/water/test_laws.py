@@ -1,7 +1,5 @@
 """The tables of laws: what a law must say before it may stand in them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax
@@ -9,14 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import ROOT, accelerate, at_rest, box_robot, march, read, world
+from laboratory import ROOT, at_rest, box_robot, march, world
 from mjx_revolve.body.module_types import Part
 from mjx_revolve.body.params import check_overrides
-from mjx_revolve.engine.batch import fit_capacity, pack_bodies
-from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.level import PartLaws, Parts
-from mjx_revolve.engine.population import acceleration
-from mjx_revolve.engine.robot import build_robot, check_timestep
+from mjx_revolve.engine.robot import check_timestep
 from mjx_revolve.engine.step_constants import read_constants
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.config import RobustConfig
@@ -29,7 +24,6 @@ from mjx_revolve.numerics.spatial import dot, mul
 from mjx_revolve.water.added_mass import CarriedWater
 from mjx_revolve.water.buoyancy import BUOYANCY_LAWS
 from mjx_revolve.water.drag import DRAG_LAWS, find_drag_law
-from mjx_revolve.water.flow import water_of
 from mjx_revolve.water.laws import (
     Coefficient,
     Drag,
@@ -127,9 +121,6 @@ def test_no_law_adds_energy_and_padding_has_no_effect(law):
         assert not np.any(angular)
 
 
-# ------------------------------------------------------------------------- a law of one's own
-
-
 @law_numbers
 class LinearNumbers:
     """Drag per velocity."""
@@ -185,25 +176,6 @@ def test_a_law_in_the_table_needs_nothing_else(linear):
     assert track.qvel[-1, 0] == pytest.approx(after[-1, 0, 0], rel=1e-6)
     check_timestep(plain)
     assert "drag: linear" in make_mjcf(plain) and "drag: linear" in make_sdf(plain)
-
-
-@pytest.mark.slow
-def test_a_law_in_the_table_steps_different_bodies_side_by_side(linear):
-    """One of two parts of another law, so that tables are padded."""
-    tank = world(drag="linear")
-    limb = read("body: {type: Core, children: {1: {type: FixedBrick, params: {drag: faces}}}}")
-    robots = [build_robot(limb, tank), box_robot((0.1, 0.08, 0.06), 0.3, tank)]
-    capacity = fit_capacity(robots)
-    qpos, qvel = at_rest(robots[0], 2, -5.0)
-    qvel[:6] = np.random.default_rng(0).normal(size=(6, 2))
-    with jax.enable_x64(True):
-        packed = jax.tree.map(jnp.asarray, pack_bodies(robots, capacity, np.float64))
-        tree = make_batched_trees(tank, capacity, packed, 2)
-        ctrl = packed.plant.arrange(jnp.zeros((capacity.hinges, 2)))
-        found = acceleration(tree, jnp.asarray(qpos), jnp.asarray(qvel), ctrl, water_of(tank))
-    for k, robot in enumerate(robots):
-        alone = accelerate(robot, qpos[:, k : k + 1], qvel[:, k : k + 1])
-        assert np.asarray(found)[:6, k] == pytest.approx(alone[:, 0], rel=1e-9)
 
 
 def test_a_coefficient_out_of_its_bounds_or_of_no_law_is_an_error(linear):

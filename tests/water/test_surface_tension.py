@@ -1,7 +1,5 @@
 """Surface tension on a box: the textbook's pull at upright walls, one energy, nothing far away."""
 
-from __future__ import annotations
-
 import itertools
 from functools import lru_cache
 
@@ -53,22 +51,6 @@ def faces(half):
         yield 4 * half[j] * half[k], side * half[i] * np.eye(3)[i], j, k
 
 
-def wetting(t):
-    """Share to which a point at depth t is wet: the triangle's integral."""
-    x = np.clip(np.asarray(t) / BLUR, -1, 1)
-    return np.where(x < 0, (1 + x) ** 2 / 2, 1 - (1 - x) ** 2 / 2)
-
-
-def counted_energy(up, depth, half, angle, n=400):
-    """E by counting points on the faces."""
-    u, v = np.meshgrid(*[(np.arange(n) + 0.5) / n * 2 - 1] * 2)
-    total = 0.0
-    for area, center, j, k in faces(half):
-        t = depth - up @ center - up[j] * half[j] * u - up[k] * half[k] * v
-        total -= area * wetting(t).mean()
-    return TENSION * np.cos(angle) * total
-
-
 def energy(up, depth, half, angle):
     """E by the corners of the faces: the textbook's sum, for edges far from level."""
     total = 0.0
@@ -89,17 +71,8 @@ def energy_slopes():
     return jax.jit(slope, compiler_options=QUICK)
 
 
-def test_the_reference_itself_against_counting_points():
-    for up, depth in zip(attitudes(4), (-0.01, 0.0, 0.004, 0.02), strict=True):
-        for half in BOXES.values():
-            counted = counted_energy(up, depth, half, 1.0)
-            with jax.enable_x64(True):
-                exact = float(energy(jnp.asarray(up), depth, half, 1.0))
-            assert exact == pytest.approx(counted, rel=1e-4)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("angle", [0.0, 1.2, np.pi / 2, 2.5])
+@pytest.mark.parametrize("angle", [0.0, 2.5])
 @pytest.mark.parametrize("axis", range(3))
 def test_upright_walls_are_pulled_by_the_length_of_their_waterline(angle, axis):
     """The force of a Wilhelmy plate: -γ cos θ × perimeter, straight down, without a torque."""
@@ -113,35 +86,6 @@ def test_upright_walls_are_pulled_by_the_length_of_their_waterline(angle, axis):
     expected = -TENSION * np.cos(angle) * perimeter * up
     assert force == pytest.approx(expected, rel=1e-12, abs=1e-15)
     assert torque == pytest.approx(0.0, abs=1e-15)
-
-
-@pytest.mark.slow
-def test_a_wetting_body_is_pulled_down_and_a_shedding_one_up():
-    up = attitudes(50, 1)
-    for angle, sign in ((0.5, -1), (2.0, 1)):
-        force, _ = pull(up, np.zeros(50), CORE, angle)
-        assert np.all(sign * np.sum(force * up, 1) > 0)
-
-
-def test_an_inclined_wall_is_pulled_by_its_waterline_over_its_steepness():
-    """A wall at φ from upright wets 1/cos φ as much per depth: γ cos θ/cos φ per metre of line.
-
-    A long plate, its narrow faces uncounted, turned about a level edge.
-    """
-    half, tilt = np.array([0.05, 1e-3, 0.04]), 0.4
-    up = np.array([[0.0, np.sin(tilt), np.cos(tilt)]])
-    force, _ = pull(up, [0.0], half, 0.0, (0.0, 1.0, 0.0))
-    expected = -TENSION * 2 * (2 * half[0]) / np.cos(tilt)
-    assert np.sum(force * up) == pytest.approx(expected, rel=1e-12)
-
-
-@pytest.mark.slow
-def test_faces_that_the_water_does_not_reach_do_not_count():
-    up, depth = attitudes(20, 2), np.zeros(20)
-    whole = pull(up, depth, CORE)
-    parts = [pull(up, depth, CORE, exposed=tuple(row)) for row in np.eye(3)]
-    for i in range(2):
-        assert sum(part[i] for part in parts) == pytest.approx(whole[i], abs=1e-15)
 
 
 @pytest.mark.slow
@@ -165,44 +109,6 @@ def test_force_and_torque_are_the_slopes_of_the_energy(name, angle):
     assert torque32 == pytest.approx(torque, abs=2e-4 * scale * half.max())
 
 
-@pytest.mark.parametrize("name", BOXES)
-def test_energy_is_conserved_along_a_path(name):
-    """The work on a tumbling box that dips in and comes out is the energy it loses.
-
-    In between it passes level and edge-level attitudes and flush faces; 2000 steps of Simpson's
-    rule.
-    """
-    half, angle = BOXES[name], 0.7
-    time = np.linspace(0.0, 1.0, 4001)
-    # Turning at constant rate about one axis of the world's; exact attitudes, any path will do.
-    spin = np.array([0.0, 2 * np.pi, 0.0])
-    turn = spin[1] * time + 0.3
-    lean = 0.35
-    up = np.stack(
-        [
-            np.cos(lean) * np.sin(turn),
-            np.full_like(time, np.sin(lean)),
-            np.cos(lean) * np.cos(turn),
-        ],
-        -1,
-    )
-    # The vertical seen from a body turning at w (body frame) changes by n × w; w along y here.
-    spin = np.array([0.0, -2 * np.pi, 0.0])
-    rate = np.gradient(up, time, axis=0, edge_order=2)
-    assert rate == pytest.approx(np.cross(up, spin), abs=1e-3)
-    height = half.max() + BLUR
-    depth = height * (0.2 + np.sin(3 * time))
-    climb = -3 * height * np.cos(3 * time)
-    force, torque = pull(up, depth, half, angle)
-    power = np.sum(force * up, 1) * climb + torque @ spin
-    step = time[1] - time[0]
-    work = step / 3 * (power[0] + power[-1] + 4 * power[1:-1:2].sum() + 2 * power[2:-1:2].sum())
-    with jax.enable_x64(True):
-        first, last = (float(energy(jnp.asarray(up[i]), depth[i], half, angle)) for i in (0, -1))
-    assert abs(last - first) > 1e-6
-    assert work == pytest.approx(first - last, rel=1e-5)
-
-
 @pytest.mark.parametrize("x64", [True, False])
 def test_nothing_wholly_under_or_out(x64):
     up = np.concatenate([attitudes(30, 4), np.eye(3), -np.eye(3)])
@@ -222,8 +128,8 @@ def test_nothing_without_tension_weight_or_wetting():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", BOXES)
-@pytest.mark.parametrize("tilt", [0.0, 5e-3, 0.3])
+@pytest.mark.parametrize("name", ["plate"])
+@pytest.mark.parametrize("tilt", [0.0, 5e-3])
 def test_force_and_torque_are_continuous_through_the_surface(name, tilt):
     """Halving the spacing of the samples halves the largest jump, for level faces too."""
     half = BOXES[name]
@@ -276,21 +182,3 @@ def test_gradients_are_finite_and_right(x64):
                 ]
                 expected = np.stack(rows, -1)
                 assert found == pytest.approx(expected, abs=2e-5 * max(1, np.abs(expected).max()))
-
-
-@pytest.mark.slow
-def test_lanes_parts_and_vmap_agree():
-    """`[npart, nbody, lanes]` with a table of sizes, or one state at a time."""
-    draw = np.random.default_rng(4)
-    up = attitudes(24, 8).T.reshape(3, 2, 3, 4)
-    depth = draw.uniform(-0.02, 0.02, (2, 3, 4))
-    half = draw.uniform(0.02, 0.08, (3, 2, 3, 1))
-    with jax.enable_x64(True):
-        together = jax.jit(lambda u, d: surface_tension(tuple(u), d, tuple(half), TENSION, WEIGHT))(
-            up, depth
-        )
-        flat = np.broadcast_to(half, up.shape).reshape(3, -1).T
-        one = jax.vmap(lambda u, d, h: surface_tension(tuple(u), d, tuple(h), TENSION, WEIGHT))
-        each = one(up.reshape(3, -1).T, depth.ravel(), flat)
-    for a, b in zip(together, each, strict=True):
-        assert np.stack(a).reshape(3, -1) == pytest.approx(np.stack(b), abs=1e-14)

@@ -1,7 +1,5 @@
 """Laws that remember: plates that swing, fins whose lift lags behind their angle."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 
@@ -16,7 +14,7 @@ from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.batched_trees import make_batched_trees
-from mjx_revolve.engine.population import PopulationEngine, make_population_engine
+from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.numerics.spatial import dot
 from mjx_revolve.water.cross_flow import CROSS_FLOW
@@ -74,9 +72,6 @@ def past(law, numbers, velocities, dt):
     return jax.lax.scan(step, first, jnp.asarray(velocities))
 
 
-# ------------------------------------------------------------------------- plates
-
-
 def test_thin_parts_alone_are_plates():
     assert thinness([0.004, 0.2, 0.1]) == 1.0
     assert thinness([0.1, 0.015, 0.2]) == pytest.approx(0.5)
@@ -108,7 +103,7 @@ def test_a_steady_plate_has_the_drag_of_its_aspect_ratio(plate):
     assert -ends[0] / (0.5 * WATER.density) == pytest.approx(1.98, rel=1e-6)
 
 
-@pytest.mark.parametrize("number", [4.0, 10.0, 40.0])
+@pytest.mark.parametrize("number", [4.0, 40.0])
 def test_a_swinging_plate_has_the_drag_of_ikedas_fit_and_its_work(number, plate):
     """C_d and work per cycle over KC, at another speed and size than in `experiments.measured`."""
     period, dt = 0.8, 0.002
@@ -160,10 +155,7 @@ def test_a_plate_in_pieces_is_one_plate():
         assert float(half.faces[0]) == pytest.approx(float(whole.faces[0]) / 2)
 
 
-# ------------------------------------------------------------------------- fins
-
-
-@pytest.mark.parametrize("frequency", [0.1, 0.5, 1.5])
+@pytest.mark.parametrize("frequency", [0.1, 1.5])
 def test_a_fins_lift_lags_as_theodorsens_function_says(frequency, fin):
     """In small heave, lift over the quasi-steady one is C(k), k = ω c / 2 U, within 3 %."""
     speed, chord = 0.5, float(fin.chord)
@@ -201,9 +193,6 @@ def test_a_fin_in_steady_flow_lifts_as_before_and_its_drag_follows(fin):
     assert drag == pytest.approx(lift * np.tan(angle) + friction, rel=1e-3)
     plain = LIFT_DRAG.force(PartFlow(tuple(velocity), (0.0,) * 3, 1.0), fin, WATER).force
     assert force @ across == pytest.approx(np.array(plain) @ across, rel=1e-4)
-
-
-# ------------------------------------------------------------------------- both, in the engine
 
 
 @pytest.mark.parametrize("law", [PLATE_WAKE, FIN_WAKE], ids=lambda law: law.name)
@@ -274,18 +263,3 @@ def test_both_engines_and_bodies_side_by_side_remember_alike():
 
     end = jax.jit(lambda s: jax.lax.scan(step, s, jnp.asarray(ctrl[:, 0, 0]))[0])(start)
     np.testing.assert_allclose(engine.observe(end)[1][:, 0], one[1][-1][:, 0], atol=1e-8)
-
-
-@pytest.mark.slow
-def test_steps_converge_and_need_no_added_mass():
-    ends = []
-    for dt in (0.01, 0.005, 0.0025):
-        robot = swimmer(timestep=dt)
-        qpos, qvel = at_rest(robot, 1, -5.0)
-        qvel[0] = 0.2
-        steps = round(1.0 / dt)
-        ends.append(march(robot, 1.0, qpos, qvel, stroke(robot, steps), every=steps)[1][-1, :3, 0])
-    first, second = (np.linalg.norm(ends[k] - ends[k + 1]) for k in range(2))
-    assert second < 0.7 * first and second < 0.03 * np.linalg.norm(ends[2] - [0, 0, -5.0])
-    state = make_population_engine(robot).init(*map(jnp.asarray, (qpos, qvel)))
-    assert state.submerged and jax.tree.leaves(state.submerged)

@@ -1,7 +1,5 @@
 """The water's own motion against its closed forms: waves, shear, velocities on a grid, gusts."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,9 +56,6 @@ def differences(function, place, d=1e-5):
     return np.stack([(function(place + s) - function(place - s)) / (2 * d) for s in steps])
 
 
-# ------------------------------------------------------------------------- what is absent
-
-
 def test_still_water_costs_nothing():
     """Plain numbers in, plain numbers out: nothing reaches the compiled step."""
     world = make_world(waves={"amplitude": 0, "wavelength": 3})
@@ -103,10 +98,7 @@ def test_all_motion_adds_up():
     assert np.allclose(push, acceleration + alone[2][1], rtol=0, atol=1e-13)
 
 
-# ------------------------------------------------------------------------- waves
-
-
-@pytest.mark.parametrize("relative", [1e-3, 0.03, 0.5, 1.0, 3.0, 30.0, 1e3])
+@pytest.mark.parametrize("relative", [1e-3, 0.5, 3.0, 30.0])
 def test_dispersion(relative):
     """ω² = g k tanh(k h), from length to frequency and from period back to length."""
     h = 2.0
@@ -121,14 +113,6 @@ def test_dispersion(relative):
         assert omega / k == pytest.approx(np.sqrt(G * h), rel=relative**2)
     if relative > 20:
         assert omega == pytest.approx(Wave(0.0, 2 * np.pi / k).frequency(G, None), rel=1e-13)
-
-
-def test_textbook_waves():
-    """Deep water: L = g T² / 2π = 1.561 T²; in 10 m of water a wave of 10 s is 92.4 m long."""
-    assert 2 * np.pi / Wave(0.0, period=10.0).wavenumber(G, None) == pytest.approx(156.13, abs=0.01)
-    length = 2 * np.pi / Wave(0.0, period=10.0).wavenumber(G, 10.0)
-    assert length == pytest.approx(156.13 * np.tanh(2 * np.pi * 10 / length), rel=1e-5)
-    assert length == pytest.approx(92.4, abs=0.1)
 
 
 @pytest.mark.parametrize("depth", DEPTHS)
@@ -152,15 +136,6 @@ def test_slope_of_the_surface(depth):
     world, place = make_world(waves=SEA, water_depth=depth), places()
     found = differences(lambda p: top(world, p, 0.6)[0], place)
     assert np.allclose(top(world, place, 0.6)[1], found[:2], rtol=0, atol=1e-8)
-
-
-@pytest.mark.parametrize("depth", DEPTHS)
-def test_orbital_velocity_has_a_potential_and_no_divergence(depth):
-    world, place = make_world(waves=SEA, water_depth=depth), places()
-    slopes = differences(lambda p: moving(world, p, 0.6)[0], place)  # [direction, component, n]
-    assert np.abs(slopes).max() > 0.3
-    assert np.abs(np.trace(slopes)).max() < 1e-8
-    assert np.abs(slopes - slopes.transpose(1, 0, 2)).max() < 1e-8
 
 
 @pytest.mark.parametrize("depth", DEPTHS)
@@ -201,19 +176,6 @@ def test_conditions_at_the_surface_and_at_the_bed(depth):
         assert np.abs(velocity[:2]).max() > 1e-3
 
 
-def test_orbits_in_deep_water_are_circles_that_fade():
-    """|u| = a ω e^(kz) at all times; half a wavelength down 4 % are left."""
-    world = make_world(waves={"amplitude": 0.1, "wavelength": 4.0}, surface_height=-0.5)
-    omega = Wave(0.1, 4.0).frequency(G, None)
-    time = np.linspace(0, 3, 50)
-    for depth, share in ((0.0, 1.0), (1.0, np.exp(-np.pi / 2)), (2.0, 0.0432), (-0.3, 1.0)):
-        place = np.stack([0 * time, 0 * time, 0 * time - 0.5 - depth])
-        velocity, acceleration = moving(world, place, time)
-        speed, push = (np.linalg.norm(v, axis=0) for v in (velocity, acceleration))
-        assert np.allclose(speed, 0.1 * omega * share, rtol=1e-3 if share == 0.0432 else 1e-12)
-        assert np.allclose(push, omega * speed, rtol=1e-12)
-
-
 def test_above_the_surface_and_below_the_bed():
     world, place = make_world(waves=SEA, water_depth=1.5), places()
     for outside, edge in ((0.7, 0.0), (-4.0, -1.5)):
@@ -234,9 +196,6 @@ def test_waves_are_carried_by_the_worlds_current():
     velocity, acceleration = moving(world, carried, time)
     assert np.allclose(velocity - drift, moving(still, place, time)[0], rtol=0, atol=1e-13)
     assert np.allclose(acceleration, moving(still, place, time)[1], rtol=0, atol=1e-12)
-
-
-# ------------------------------------------------------------------------- shear
 
 
 @pytest.mark.parametrize(
@@ -270,9 +229,6 @@ def test_shear_profiles(shear, depth, share):
     assert np.allclose(moving(world, (0 * z, 0 * z, z), **lanes)[0], expected, rtol=0, atol=1e-6)
 
 
-# ------------------------------------------------------------------------- a grid
-
-
 EVEN = (np.linspace(-5, 5, 11), np.linspace(-3, 6, 4), np.linspace(-8, 0, 5))
 UNEVEN = (np.array([-5, -4.9, -1, 0, 0.5, 3, 5]), np.array([-3.0, 6.0]), np.array([-8, -2, 0.0]))
 
@@ -281,23 +237,6 @@ def grid(axes, seed=0):
     """Random velocities on it."""
     shape = (*map(len, axes), 3)
     return CurrentField(*axes, np.random.default_rng(seed).normal(size=shape))
-
-
-@pytest.mark.parametrize("axes", [EVEN, UNEVEN], ids=["even", "uneven"])
-def test_interpolation_is_exact_for_what_is_linear_along_each_axis(axes):
-    draw = np.random.default_rng(1)
-    factors = draw.normal(size=(3, 2, 2, 2))
-
-    def law(x, y, z):
-        powers = [[x**i * y**j * z**k for k in (0, 1)] for i in (0, 1) for j in (0, 1)]
-        return np.einsum("cijk,ijk...->c...", factors, np.reshape(powers, (2, 2, 2, *x.shape)))
-
-    velocity = law(*np.meshgrid(*axes, indexing="ij"))
-    field = CurrentField(*axes, np.moveaxis(velocity, 0, -1))
-    low, high = [a[0] for a in axes], [a[-1] for a in axes]
-    place = draw.uniform(low, high, (500, 3)).T
-    found = moving(make_world(current_field=field), place)[0]
-    assert np.allclose(found, law(*place), rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("axes", [EVEN, UNEVEN], ids=["even", "uneven"])
@@ -315,27 +254,11 @@ def test_interpolation_and_edges_against_scipy(axes):
     assert np.allclose(found[:, 2000:], field.velocity.reshape(-1, 3).T, rtol=0, atol=1e-12)
 
 
-def test_an_axis_with_one_plane_does_not_matter():
-    x, y, z = EVEN
-    plane = grid((x, y, z[:1]))
-    place = places()
-    for axes in ((x, y, z), (x, y, np.array([-2.0, 7.0]))):
-        thick = np.repeat(plane.velocity, len(axes[2]), 2)
-        same = moving(make_world(current_field=CurrentField(*axes, thick)), place)[0]
-        found = moving(make_world(current_field=plane), place)[0]
-        assert np.allclose(found, same, rtol=0, atol=1e-13)
-    point = CurrentField([1.0], [2.0], [3.0], np.array([0.1, 0.2, 0.3]).reshape(1, 1, 1, 3))
-    assert np.all(moving(make_world(current_field=point), place)[0].T == [0.1, 0.2, 0.3])
-
-
 def test_a_component_that_is_nowhere_costs_nothing():
     field = CurrentField(*EVEN, grid(EVEN).velocity * [1.0, 1.0, 0.0])
     world = make_world(current_field=field)
     velocity, _ = flow(world, water_of(world), *jnp.asarray(places()))
     assert isinstance(velocity[2], float)
-
-
-# ------------------------------------------------------------------------- any state
 
 
 WORLDS = {
@@ -413,36 +336,11 @@ def test_gradients_against_differences(name):
     assert np.allclose(np.moveaxis(found, 1, 2), expected, rtol=0, atol=1e-7)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", WORLDS)
-def test_jit_and_vmap(name):
-    """Of one place at a time, and of a level of bodies `[nbody, lanes]` with lanes' own water."""
-    world, place = make_world(**WORLDS[name]), places(12)
-    with jax.enable_x64(True):
-        x, y, z = jnp.asarray(place)
-        time = jnp.linspace(0, 1, 12)
-
-        def velocity(x, y, z, t):
-            water = water_of(world)._replace(time=t)
-            return jnp.stack([c + 0 * z for c in flow(world, water, x, y, z)[0]])
-
-        plain, compiled = velocity(x, y, z, time), jax.jit(velocity)
-        assert np.allclose(compiled(x, y, z, time), plain, rtol=0, atol=1e-13)
-        one = jax.jit(jax.vmap(velocity, out_axes=1))(x, y, z, time)
-        assert np.allclose(one, plain, rtol=0, atol=1e-13)
-        level = compiled(*(v.reshape(3, 4) for v in place), np.linspace(0, 1, 12)[:4])
-        again = compiled(x, y, z, np.tile(np.linspace(0, 1, 12)[:4], 3))
-        assert np.allclose(level.reshape(3, 12), again, rtol=0, atol=1e-13)
-
-
-# ------------------------------------------------------------------------- gusts
-
-
 STD = np.array([0.3, 0.1, 0.02])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("relative", [1e-3, 0.01, 0.1, 1.0, 5.0])
+@pytest.mark.parametrize("relative", [0.01, 0.1, 5.0])
 def test_gusts_have_the_mean_variance_and_memory_that_were_asked_for(relative):
     """At any time step, within 4.5 standard errors of each estimate: 1 in 150,000 by chance.
 
@@ -474,24 +372,3 @@ def test_gusts_have_the_mean_variance_and_memory_that_were_asked_for(relative):
     assert abs(added.var() - 1) < 4.5 * np.sqrt(2 / added.size)
     assert abs(np.mean(added[1:] * added[:-1])) < 4.5 / np.sqrt(added.size)
     assert abs(np.mean(added * u[:-1])) < 4.5 / np.sqrt(added.size)
-
-
-def test_gusts_belong_to_their_key():
-    gust = Gust(tuple(STD), time=4.0)
-    path = gust_path(gust, jax.random.key(3), 40, 0.1, 5)
-    assert np.array_equal(path, gust_path(gust, jax.random.key(3), 40, 0.1, 5))
-    assert not np.any(path == gust_path(gust, jax.random.key(4), 40, 0.1, 5))
-    # A longer episode begins like a shorter one.
-    assert np.array_equal(path, gust_path(gust, jax.random.key(3), 90, 0.1, 5)[:41])
-    drawn = jax.jit(lambda key: gust_path(gust, key, 40, 0.1, 5))
-    assert np.allclose(drawn(jax.random.key(3)), path, rtol=0, atol=1e-6)
-    keys = jax.vmap(jax.random.key)(jnp.arange(4))
-    assert np.allclose(jax.vmap(drawn)(keys)[3], path, rtol=0, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_gusts_of_no_size():
-    path = gust_path(Gust((0.0, 0.2, 0.0), time=4.0), jax.random.key(0), 40, 0.1, 5)
-    assert not np.any(path[:, [0, 2]])
-    assert np.all(path[:, 1])
-    assert Gust(0.2).std == (0.2, 0.2, 0.0)

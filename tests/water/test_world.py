@@ -1,7 +1,5 @@
 """Worlds: the two that ship, users' own, overrides, every wrong input, and the lake's shape."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
@@ -33,15 +31,9 @@ def count(kind) -> int:
     return len(dataclasses.fields(kind))
 
 
-BED_FIELDS = fields(Bed)
-UNKNOWN = "found an unknown key; did you mean"
 DOWN = "gravity: expected a number, or (0, 0, -g), since the surface is level [m/s2]; found"
-STD = "gust.std: expected a number or three numbers >= 0 [m/s]; found"
-HUGE = "1" + 17 * "0" + "..." + 19 * "0"
+UNKNOWN = "found an unknown key; did you mean"
 LAKE = load_world("lake").bed
-
-
-# ------------------------------------------------------------------------- reading
 
 
 @pytest.mark.parametrize("name", ["empty_underwater", "lake"])
@@ -112,44 +104,22 @@ timestep: 2e-3
 @pytest.mark.parametrize(
     ("override", "field", "expected"),
     [
-        ({"density": 1025}, "density", 1025),
-        ({"density": np.float32(1000)}, "density", 1000.0),
-        ({"gravity": 1.62}, "gravity", 1.62),
-        ({"gravity": (0, 0, -9.81)}, "gravity", 9.81),
         ({"gravity": np.array([0.0, 0.0, -9.81])}, "gravity", 9.81),
-        ({"gravity": [0, 0, 0]}, "gravity", 0.0),
-        ({"surface_height": -2.5}, "surface_height", -2.5),
-        ({"current": (0.1, 0, 0)}, "current", (0.1, 0.0, 0.0)),
         ({"current": np.array([0.1, 0.2, 0.3])}, "current", (0.1, 0.2, 0.3)),
-        ({"buoyancy": "mask"}, "buoyancy", "mask"),
         ({"buoyancy": False}, "buoyancy", "off"),
-        ({"drag": "ellipsoid"}, "drag", "ellipsoid"),
         ({"drag": False}, "drag", "off"),
-        ({"added_mass": False}, "added_mass", False),
-        ({"bed": None}, "bed", None),
         ({"bed": "off"}, "bed", None),
-        ({"bed": -3}, "bed", Bed(kind="flat", height=-3.0)),
         ({"bed": np.float64(-3)}, "bed", Bed(kind="flat", height=-3.0)),
-        ({"bed": {"kind": "flat", "height": -3}}, "bed", Bed(kind="flat", height=-3)),
-        ({"bed": Bed(kind="flat")}, "bed", Bed(kind="flat")),
         # A mapping keeps what it does not name: the lake stays a lake.
         ({"bed": {"friction": 0.2}}, "bed", dataclasses.replace(LAKE, friction=0.2)),
         ({"lift_drag": {"cda": 0.1}}, "lift_drag", LiftDrag(cda=0.1)),
         ({"shear": {"velocity": np.ones(3)}}, "shear", Shear((1.0, 1.0, 1.0))),
-        ({"shear": Shear((1, 0, 0))}, "shear", Shear((1.0, 0.0, 0.0))),
-        ({"shear": "off"}, "shear", None),
         ({"gust": {"std": np.float32(0.5)}}, "gust", Gust((0.5, 0.5, 0.0))),
         ({"gust": {"std": [0.1, 0, 0.2]}}, "gust", Gust((0.1, 0.0, 0.2))),
-        ({"gust": None}, "gust", None),
         ({"waves": {"amplitude": 0, "period": 2}}, "waves", (Wave(0, period=2),)),
         ({"waves": [Wave(0.1, 3), Wave(0.1, 4)]}, "waves", (Wave(0.1, 3), Wave(0.1, 4))),
-        ({"waves": []}, "waves", ()),
-        ({"water_depth": np.float32(8)}, "water_depth", 8.0),
         ({"surface_tension": True}, "surface_tension", SurfaceTension()),
         ({"surface_tension": {"gamma": 0.03}}, "surface_tension", SurfaceTension(0.03)),
-        ({"surface_tension": False}, "surface_tension", None),
-        ({"current_field": None}, "current_field", None),
-        ({"timestep": 0.002}, "timestep", 0.002),
     ],
 )
 def test_overrides(override, field, expected):
@@ -159,135 +129,37 @@ def test_overrides(override, field, expected):
     assert all(getattr(water, name) == getattr(load_world("lake"), name) for name in rest)
 
 
-def test_make_world_without_a_file():
-    assert make_world() == World()
-    assert make_world(bed=-2, current=[0, 0.1, 0]) == World(
-        bed=Bed(kind="flat", height=-2.0), current=(0.0, 0.1, 0.0)
-    )
-
-
-# ------------------------------------------------------------------------- wrong inputs
-
-
 WRONG = [
-    ({"density": "heavy"}, "density: expected a number >= 0 [kg/m3]; found 'heavy'"),
-    ({"density": True}, "density: expected a number >= 0 [kg/m3]; found True"),
-    ({"density": None}, "density: expected a number >= 0 [kg/m3]; found None"),
-    ({"density": [999]}, "density: expected a number >= 0 [kg/m3]; found [999]"),
-    ({"density": -1}, "density: expected a number >= 0 [kg/m3]; found -1"),
     ({"density": math.nan}, "density: expected a number >= 0 [kg/m3]; found nan"),
-    (
-        {"density": 10**400},
-        f"density: expected a number >= 0 [kg/m3]; found {HUGE}",
-    ),
-    ({"viscosity": -1e-3}, "viscosity: expected a number >= 0 [Pa s]; found -0.001"),
     (
         {"densty": 1000},
         f"densty: expected one of {count(World)} keys; {UNKNOWN} density?",
-    ),
-    ({"surface_height": math.inf}, "surface_height: expected a number [m]; found inf"),
-    ({"timestep": 0}, "timestep: expected a number >= 1e-05 and <= 0.1 [s]; found 0"),
-    ({"timestep": 1}, "timestep: expected a number >= 1e-05 and <= 0.1 [s]; found 1"),
-    ({"gravity": -9.81}, "gravity: expected a number >= 0 [m/s2]; found -9.81"),
-    ({"gravity": "down"}, "gravity: expected a number >= 0 [m/s2]; found 'down'"),
-    (
-        {"gravity": (0, -9.81)},
-        f"{DOWN} (0, -9.81)",
-    ),
-    (
-        {"gravity": ("a", 0, -1)},
-        f"{DOWN} ('a', 0, -1)",
     ),
     (
         {"gravity": (1, 0, -9.8)},
         f"{DOWN} (1, 0, -9.8)",
     ),
-    (
-        {"gravity": (0, 0, 9.8)},
-        f"{DOWN} (0, 0, 9.8)",
-    ),
-    ({"gravity": (0, 0, math.nan)}, "gravity: expected a number >= 0 [m/s2]; found (0, 0, nan)"),
-    ({"current": (1, 2)}, "current: expected three numbers [m/s]; found (1, 2)"),
-    ({"current": (1, 2, 3, 4)}, "current: expected three numbers [m/s]; found (1, 2, 3, 4)"),
-    ({"current": 0.1}, "current: expected three numbers [m/s]; found 0.1"),
-    ({"current": "fast"}, "current: expected three numbers [m/s]; found 'fast'"),
     ({"current": (0, "x", 0)}, "current.1: expected a number [m/s]; found 'x'"),
-    ({"current": (0, 0, math.inf)}, "current.2: expected a number [m/s]; found inf"),
     ({"buoyancy": "half"}, "buoyancy: expected one of partial, mask, off; found 'half'"),
     (
         {"drag": "boxes"},
         f"drag: expected {drag_names()}; found 'boxes'",
     ),
-    ({"added_mass": "yes"}, "added_mass: expected true or false; found 'yes'"),
-    ({"added_mass": 1}, "added_mass: expected true or false; found 1"),
     (
         {"bed": "sand"},
         "bed: expected 'off', a height in metres or a mapping with kind; found 'sand'",
     ),
-    ({"bed": True}, "bed: expected 'off', a height in metres or a mapping with kind; found True"),
-    ({"bed": math.nan}, "bed: expected a number [m]; found nan"),
     ({"bed": {"kind": "hill"}}, "bed.kind: expected one of flat, lake; found 'hill'"),
-    ({"bed": {"depth": 1}}, f"bed.depth: expected one of {BED_FIELDS}; {UNKNOWN} shear.depth?"),
-    ({"bed": {"height": "low"}}, "bed.height: expected a number [m]; found 'low'"),
-    ({"bed": {"friction": math.nan}}, "bed.friction: expected a number >= 0 [-]; found nan"),
-    (
-        {"bed": {"stiffness": -1}},
-        "bed.stiffness: expected a number > 0 [N/m]; found -1",
-    ),
-    ({"bed": {"height": 40}}, "bed.highest: expected more than height (40); found 36.7"),
-    ({"lift_drag": 3}, "lift_drag: expected a mapping; found 3"),
     (
         {"lift_drag": {"cl": 1}},
         f"lift_drag.cl: expected one of {count(LiftDrag)} keys; {UNKNOWN} lift_drag.cla?",
     ),
-    ({"lift_drag": {"cla": "x"}}, "lift_drag.cla: expected a number [1/rad]; found 'x'"),
-    ({"lift_drag": {"a0": math.nan}}, "lift_drag.a0: expected a number [rad]; found nan"),
-    ({"shear": 0.1}, "shear: expected a mapping with velocity, or nothing; found 0.1"),
-    ({"shear": {"depth": 3}}, "shear.velocity: expected three numbers [m/s]; found none"),
     (
         {"shear": {"speed": 3}},
         f"shear.speed: expected one of {fields(Shear)}; found an unknown key "
         "(and 1 more: shear.velocity)",
     ),
-    ({"shear": {"velocity": 1}}, "shear.velocity: expected three numbers [m/s]; found 1"),
-    (
-        {"shear": {"velocity": [1, "a", 0]}},
-        "shear.velocity.1: expected a number [m/s]; found 'a'",
-    ),
-    (
-        {"shear": {"velocity": [1, 0, 0], "depth": 0}},
-        "shear.depth: expected a number >= 0.001 [m]; found 0",
-    ),
-    (
-        {"shear": {"velocity": [1, 0, 0], "exponent": "1/7"}},
-        "shear.exponent: expected a number >= 0.001 [-]; found '1/7'",
-    ),
-    (
-        {"shear": {"velocity": [1, 0, 0], "profile": "log"}},
-        "shear.profile: expected one of linear, power, exponential; found 'log'",
-    ),
-    ({"gust": {"time": 3}}, f"{STD} none"),
-    ({"gust": 0.1}, "gust: expected a mapping with std, or nothing; found 0.1"),
-    ({"gust": {"std": -1}}, "gust.std: expected a number >= 0 [m/s]; found -1"),
-    (
-        {"gust": {"std": True}},
-        f"{STD} True",
-    ),
-    (
-        {"gust": {"std": "strong"}},
-        f"{STD} 'strong'",
-    ),
-    (
-        {"gust": {"std": [1, 2]}},
-        f"{STD} [1, 2]",
-    ),
     ({"gust": {"std": [1, -2, 0]}}, "gust.std.1: expected a number >= 0 [m/s]; found -2"),
-    ({"gust": {"std": math.nan}}, "gust.std: expected a number >= 0 [m/s]; found nan"),
-    ({"gust": {"std": 1, "time": 0}}, "gust.time: expected a number >= 0.001 [s]; found 0"),
-    ({"waves": 3}, "waves: expected a list of mappings with amplitude; found 3"),
-    ({"waves": "big"}, "waves: expected a list of mappings with amplitude; found 'big'"),
-    ({"waves": [0.1]}, "waves.0: expected a mapping with amplitude; found 0.1"),
-    ({"waves": [{"wavelength": 1}]}, "waves.0.amplitude: expected a number >= 0 [m]; found none"),
     (
         {"waves": {"amplitude": 0.1}},
         "waves.0: expected either wavelength or period; found none",
@@ -295,39 +167,6 @@ WRONG = [
     (
         {"waves": {"amplitude": 0.1, "wavelength": 3, "period": 1}},
         "waves.0: expected either wavelength or period; found both",
-    ),
-    (
-        {"waves": {"amplitude": 0.1, "length": 3}},
-        f"waves.0.length: expected one of {fields(Wave)}; {UNKNOWN} waves.0.wavelength?",
-    ),
-    (
-        {"waves": [{"amplitude": 0, "wavelength": 9}, {"amplitude": "a", "wavelength": 9}]},
-        "waves.1.amplitude: expected a number >= 0 [m]; found 'a'",
-    ),
-    (
-        {"waves": {"amplitude": -0.1, "wavelength": 3}},
-        "waves.0.amplitude: expected a number >= 0 [m]; found -0.1",
-    ),
-    (
-        {"waves": {"amplitude": 0, "wavelength": 0.001}},
-        "waves.0.wavelength: expected a number >= 0.01 [m], or nothing; found 0.001",
-    ),
-    (
-        {"waves": {"amplitude": 0, "period": 0.05}},
-        "waves.0.period: expected that of a wave of at least 0.01 m; found 0.05 s, a wave of "
-        "0.0039 m",
-    ),
-    (
-        {"waves": {"amplitude": 0, "wavelength": 3, "direction": 45}},
-        "waves.0.direction: expected a number >= -6.28319 and <= 6.28319 [rad]; found 45",
-    ),
-    (
-        {"waves": {"amplitude": 0, "wavelength": 3, "phase": -90}},
-        "waves.0.phase: expected a number >= -6.28319 and <= 6.28319 [rad]; found -90",
-    ),
-    (
-        {"waves": {"amplitude": 0.1, "wavelength": 3}, "gravity": 0},
-        "waves.0: expected gravity above 0; found 0",
     ),
     # Miche: 2 a / L at most 0.142, a = 0.071 m at 1 m.
     (
@@ -339,28 +178,9 @@ WRONG = [
         {"waves": {"amplitude": 0.05, "wavelength": 10}, "water_depth": 0.1},
         "waves.0.amplitude: expected at most 0.0446, or a wave 10 m long breaks; found 0.05",
     ),
-    ({"water_depth": 0}, "water_depth: expected a number >= 0.01 [m], or nothing; found 0"),
-    (
-        {"water_depth": "deep"},
-        "water_depth: expected a number >= 0.01 [m], or nothing; found 'deep'",
-    ),
-    ({"surface_tension": 0.07}, "surface_tension: expected a mapping, or nothing; found 0.07"),
-    (
-        {"surface_tension": {"gamma": 0}},
-        "surface_tension.gamma: expected a number >= 1e-06 [N/m]; found 0",
-    ),
-    (
-        {"surface_tension": {"contact_angle": 90}},
-        "surface_tension.contact_angle: expected a number >= 0 and <= 3.14159 [rad]; found 90",
-    ),
-    ({"current_field": 3}, "current_field: expected the path of a file; found 3"),
     (
         {"current_field": "none.npz"},
         "current_field: none.npz: expected a file; found none",
-    ),
-    (
-        {"current_field": "field.txt"},
-        "current_field: field.txt: expected a file .npz or .csv; found .txt",
     ),
 ]
 
@@ -376,14 +196,7 @@ def test_wrong_overrides(override, message):
     ("text", "message"),
     [
         ("", "expected a mapping of world fields; found None"),
-        ("[1, 2]", "expected a mapping of world fields; found [1, 2]"),
         ("1: 2", "1: expected the name of a setting; found a key that is no text"),
-        (
-            "densty: 3",
-            f"densty: expected one of {count(World)} keys; {UNKNOWN} density?",
-        ),
-        ("density: [1]", "density: expected a number >= 0 [kg/m3]; found [1]"),
-        ("bed: {1: 2}", "bed.1: expected the name of a setting; found a key that is no text"),
         ("name: 3", "name: expected a text; found 3"),
         ("density: 1\ndensity: 2", "line 2: expected each key once; found 'density' twice"),
     ],
@@ -406,9 +219,6 @@ def test_unknown_worlds(tmp_path):
         load_world(tmp_path / "none.yaml")
     with pytest.raises(InputError, match=r"^world: expected a name or a path; found 5$"):
         load_world(5)
-
-
-# ------------------------------------------------------------------------- velocities on a grid
 
 
 X, Y, Z = np.array([0.0, 1.0, 3.0]), np.array([-1.0, 2.0]), np.array([-4.0, -1.0])
@@ -490,18 +300,13 @@ GRID = "expected one row for each of 3 x 2 x 2 points of a full grid"
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        ([], "line 1: expected columns x, y, z, u, v, w; found no x"),
         (["x,y,z,u,v"], "line 1: expected columns x, y, z, u, v, w; found no w"),
         (["x,y,z,u,v,w,x"], "line 1: expected columns x, y, z, u, v, w; found x twice"),
-        (["x,y,z,u,v,w"], "line 2: expected rows of numbers; found none"),
         (["x,y,z,u,v,w", "", "1,2,3,4,5"], "line 3: expected 6 numbers; found 5"),
-        (["x,y,z,u,v,w", "1,2,3,4,5,6,7"], "line 2: expected 6 numbers; found 7"),
         (["x,y,z,u,v,w", "1,2,3,4,5,fast"], "line 2: expected a number; found 'fast'"),
-        (["x,y,z,u,v,w", "1,2,3,,5,6"], "line 2: expected a number; found ''"),
         (["x,y,z,u,v,w", "1,2,3,4,5,nan"], "line 2: expected a finite number; found 'nan'"),
         (["x,y,z,u,v,w", *table()[1:]], f"{GRID}; found 11 rows"),
         (["x,y,z,u,v,w", *table(), table()[5]], f"{GRID}; found (1, -1, -1) twice"),
-        (["x,y,z,u,v,w", *table()[1:], table()[5]], f"{GRID}; found (1, -1, -1) twice"),
     ],
 )
 def test_wrong_tables(tmp_path, lines, message):
@@ -516,23 +321,13 @@ def test_wrong_tables(tmp_path, lines, message):
     ("changes", "message"),
     [
         ({"x": None}, "expected arrays x, y, z, velocity; found no x"),
-        ({"velocity": None}, "expected arrays x, y, z, velocity; found no velocity"),
-        ({"z": np.float64(2)}, "z: expected a row of numbers [m]; found shape []"),
         ({"y": np.zeros((2, 1))}, "y: expected a row of numbers [m]; found shape [2, 1]"),
-        ({"y": np.zeros(0)}, "y: expected a row of numbers [m]; found shape [0]"),
         ({"z": [-1.0, -4.0]}, "z: expected rising numbers [m]; found -4 after -1"),
-        ({"z": [-1.0, -1.0]}, "z: expected rising numbers [m]; found -1 after -1"),
-        ({"z": [-1.0, np.inf]}, "z: expected finite numbers; found NaN or infinity"),
         ({"x": [0.0, np.nan, 1.0]}, "x: expected finite numbers; found NaN or infinity"),
-        ({"x": ["a", "b", "c"]}, "x: expected real numbers; found <U1"),
         ({"velocity": VELOCITY + 0j}, "velocity: expected real numbers; found complex128"),
         (
             {"velocity": VELOCITY[..., :2]},
             "velocity: expected shape [3, 2, 2, 3], as x, y and z have it; found [3, 2, 2, 2]",
-        ),
-        (
-            {"velocity": np.where(VELOCITY > 1, np.nan, VELOCITY)},
-            "velocity: expected finite numbers; found NaN or infinity",
         ),
         (
             {"x": np.array([None, 1, 2])},
@@ -571,9 +366,6 @@ def test_files_that_are_no_fields(tmp_path):
             load_world("lake", current_field=tmp_path / name)
 
 
-# ------------------------------------------------------------------------- the bed
-
-
 def test_lake_extremes_are_exact():
     """-112.8 m at the bottom and +36.7 m on the shore, over 998 m x 998 m, never beyond."""
     line = np.linspace(-499, 499, 999)
@@ -598,13 +390,6 @@ def test_lake_is_always_the_same_and_has_shore_slope_and_basin():
     assert np.diff(np.sign(np.diff(first[60], 2))).any()  # dunes
 
 
-def test_lake_heights_of_other_extents():
-    bed = Bed(kind="lake", height=-3.0, highest=1.0, extent=20.0)
-    heights = sample_bed(bed, 51)
-    assert heights.max() == pytest.approx(1.0)
-    assert heights[25, 25] == pytest.approx(-3.0)
-
-
 def test_slope_against_finite_differences():
     """Central differences in float64 over 2 cm: the same numbers; over 1 mm: to what dunes bend."""
     import jax
@@ -620,16 +405,3 @@ def test_slope_against_finite_differences():
     assert slope[0] == pytest.approx(fine[0], abs=1e-4)
     assert slope[1] == pytest.approx(fine[1], abs=1e-4)
     assert np.hypot(*slope).max() < 1.0
-
-
-def test_a_flat_bed():
-    x = np.zeros(3, np.float32)
-    assert np.all(np.asarray(bed_height(Bed(height=-7.0), x, x)) == -7.0)
-    assert not any(np.any(np.asarray(s)) for s in bed_slope(Bed(), x, x))
-
-
-def test_a_gas_is_worth_a_note(caplog):
-    load_world("lake", density=1.2)
-    assert caplog.messages == [
-        "world lake: density: found 1.2 kg/m³, which is no water's (600 to 1500)"
-    ]
