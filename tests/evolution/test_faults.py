@@ -13,6 +13,7 @@ import toys
 from laboratory import ROOT, XLA_FLAGS
 from mjx_revolve import evolve
 from mjx_revolve.evolution import memory
+from mjx_revolve.evolution.run_folder import RunFolder  # noqa: F401  (the script names it)
 from mjx_revolve.inputs.commands import run_command
 
 

@@ -152,7 +152,7 @@ def test_wrong_tasks(folder, text, message):
     [
 ("Controller(n,", "Controller(n + 1,", "{own}: make_hold: gene_names: expected 3 of them, "
          "as num_genes says; found 2"),
-("jnp.sin(genes)", "jnp.sin(gene)", "{own}: line 38: expected make_hold's decode, init and "
+("jnp.sin(genes)", "jnp.sin(gene)", "{own}: line 36: expected make_hold's decode, init and "
          "step to give targets; found NameError: name 'gene' is not defined")
 ],
 )  # fmt: skip
