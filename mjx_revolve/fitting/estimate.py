@@ -306,7 +306,7 @@ def begin(problem: FitProblem, seed: int) -> FitState:
             replace(origin, free=spread * draw.normal(size=len(spread))) for _ in range(wanted)
         ]
     none = np.zeros(problem.drive.resets.shape)
-    costs = _costs(problem, points, noise)
+    costs = recording_costs(problem, points, noise)
     best = origin
     if problem.free_heading.any():
         starts = origin.starts.copy()
@@ -341,7 +341,9 @@ def _turned(roots: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return found
 
 
-def _costs(problem: FitProblem, points: list[Point], noise: dict[str, float]) -> np.ndarray:
+def recording_costs(
+    problem: FitProblem, points: list[Point], noise: dict[str, float]
+) -> np.ndarray:
     """`[points, R]` sums of squares, wild ones less."""
     tracks = problem.simulate(points)
     found = np.zeros((len(points), len(problem.recordings)))

@@ -211,8 +211,18 @@ class FitRun:
         resets[:] = arrays.get("resets", resets)  # folders of older versions have no cut windows
         point = Point(arrays["free"], arrays["local"], arrays["starts"])
         names = ("common", "generation", "cost", "moved", "inflated")
-        rest = (meta[name] for name in names)
-        self.state = FitState(point, meta["noise"], arrays["damping"], *rest, arrays.get("steps"))
+        common, iteration, cost, moved, inflated = (meta[name] for name in names)
+        self.state = FitState(
+            point,
+            meta["noise"],
+            arrays["damping"],
+            common,
+            iteration,
+            cost,
+            moved,
+            inflated,
+            arrays.get("steps"),
+        )
 
     def save(self) -> None:
         """A checkpoint of the state."""

@@ -335,6 +335,9 @@ BAD = {
     "milliseconds": (changed(time=50 * np.arange(60.0)), "found 50 s: milliseconds?"),
     "no quaternion": (changed(qw=np.full(60, 7.0), qx=np.zeros(60), qy=np.zeros(60),
                               qz=np.zeros(60)), "expected unit quaternions"),
+    "a jump": (changed(x=0.2 * np.arange(60) / 20 + 5.0 * (np.arange(60) > 30)),
+               "x: expected a way without jumps; found one of 5.01 m at 1.55 s"),
+    "in the air": (changed(z=np.full(60, 1.5)), "does z point down (--map z=COLUMN*-1)"),
 }  # fmt: skip
 
 
