@@ -115,6 +115,7 @@ def _free(text: str) -> list[str]:
 
 
 def _fit(arguments: argparse.Namespace, interrupts: Interrupts) -> int:
+    from mjx_revolve.fitting.axes import find_other_axes
     from mjx_revolve.fitting.recording import load_recording, read_map
     from mjx_revolve.fitting.run import FitRun, Request, load_robot, read_settings
 
@@ -138,6 +139,8 @@ def _fit(arguments: argparse.Namespace, interrupts: Interrupts) -> int:
         free = tuple(_free(arguments.free))
         request = Request(robot, recordings, free, settings, arguments.seed, (entry, copies))
         run = FitRun.begin(out, request)
+        for line in find_other_axes(run.problem):
+            print(plain(f"warning: {line}"), flush=True)
     try:
         return _finish(run, interrupts)
     finally:

@@ -19,6 +19,9 @@ from mjx_revolve.fitting.problem import NOISE, START, FitProblem, Point
 _HUBER = 3.0
 # The search ends when a step is below this share of each number's own uncertainty [-].
 _TOLERANCE = 0.02
+# Derivatives are over fine steps from where a step is below this share of it, one standard
+# deviation: from there on they are of what lies within the interval.
+_NEAR = 1.0
 FEW = 30
 """With fewer measurements of a kind, their noise is what is usual: a wrong model would else pass
 for noise; intervals are widened by what is left (Birge 1932). A choice."""
@@ -29,6 +32,9 @@ _SHORT_STEPS, _SHORT_TOLERANCE = 20, 0.1
 # a linear one by so much of the cost, half a square of standard deviations. A choice: from there a
 # step or two of Newton's lead back to the least cost, and from beyond, they may lead anywhere.
 _BENT, _AWAY = 20.0, 2.0
+# The search goes on from a place nearby, one or two standard deviations of some number away, where
+# the cost is so much lower: derivatives do not see beyond a jump of the motion. A choice.
+_LOWER = 0.5
 _LARGEST_STEP = 1.0  # in a logarithm, or in units of the prior
 
 
@@ -60,6 +66,8 @@ class FitState:
         moved: the last step over what the numbers are uncertain by.
         inflated: whether the residuals' correlation counts by now: only near the end is it that of
             noise and of the model, and not of a wrong point.
+        steps: `[P]` of the differences by which derivatives are found; None while they are the
+            widest ones.
     """
 
     point: Point
@@ -70,6 +78,7 @@ class FitState:
     cost: float = np.inf
     moved: float = np.inf
     inflated: bool = False
+    steps: np.ndarray | None = None
 
     @property
     def finished(self) -> bool:
@@ -92,9 +101,9 @@ class Model:
     track: np.ndarray = field(repr=False)
 
 
-def linearize(problem: FitProblem, point: Point) -> Model:
-    """The problem near a point."""
-    return Model(*problem.linearize(point))
+def linearize(problem: FitProblem, point: Point, steps: np.ndarray | None = None) -> Model:
+    """The problem near a point; `steps`: of a state."""
+    return Model(*problem.linearize(point, steps))
 
 
 def costs_of(
@@ -162,13 +171,24 @@ def prior_matrix(problem: FitProblem) -> np.ndarray:
     return np.diag([p.spread**-2.0 for p in problem.parameters])
 
 
+def with_prior(problem: FitProblem, system: System) -> np.ndarray:
+    """`[G, G]` information with all priors."""
+    matrix, count = system.matrix.copy(), len(problem.parameters)
+    matrix[:count, :count] += prior_matrix(problem)
+    return matrix
+
+
+def _spreads(problem: FitProblem, system: System) -> np.ndarray:
+    """`[P]` what the free numbers are uncertain by."""
+    covariance = np.linalg.inv(with_prior(problem, system))
+    return np.sqrt(np.diag(covariance)[: len(problem.parameters)])
+
+
 def step(problem: FitProblem, state: FitState, system: System) -> tuple[Point, float]:
     """A damped step, and how far it leads over what the numbers are uncertain by."""
     count, point = len(problem.parameters), state.point
-    matrix, slope = system.matrix.copy(), system.slope.copy()
-    prior = prior_matrix(problem)
-    matrix[:count, :count] += prior
-    slope[:count] -= prior @ point.free
+    matrix, slope = with_prior(problem, system), system.slope.copy()
+    slope[:count] -= prior_matrix(problem) @ point.free
     spread = np.sqrt(np.diag(np.linalg.inv(matrix)))
     damped = matrix + state.common * np.diag(np.diag(matrix))
     move = np.linalg.solve(damped, slope)
@@ -219,8 +239,7 @@ def estimate_noise(problem: FitProblem, values: list[np.ndarray], used: float) -
 def numbers_used(problem: FitProblem, system: System) -> float:
     """How many numbers the data have determined: the trace of information over information."""
     count = len(problem.parameters)
-    whole = system.matrix.copy()
-    whole[:count, :count] += prior_matrix(problem)
+    whole = with_prior(problem, system)
     used = float(np.trace(np.linalg.solve(whole[:count, :count], system.matrix[:count, :count])))
     for k, r, block, _, _ in system.starts:
         spread = problem.start_spread[k, :, r]
@@ -287,7 +306,7 @@ def begin(problem: FitProblem, seed: int) -> FitState:
             replace(origin, free=spread * draw.normal(size=len(spread))) for _ in range(wanted)
         ]
     none = np.zeros(problem.drive.resets.shape)
-    costs = _costs(problem, points, noise)
+    costs = recording_costs(problem, points, noise)
     best = origin
     if problem.free_heading.any():
         starts = origin.starts.copy()
@@ -322,7 +341,9 @@ def _turned(roots: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return found
 
 
-def _costs(problem: FitProblem, points: list[Point], noise: dict[str, float]) -> np.ndarray:
+def recording_costs(
+    problem: FitProblem, points: list[Point], noise: dict[str, float]
+) -> np.ndarray:
     """`[points, R]` sums of squares, wild ones less."""
     tracks = problem.simulate(points)
     found = np.zeros((len(points), len(problem.recordings)))
@@ -334,26 +355,40 @@ def _costs(problem: FitProblem, points: list[Point], noise: dict[str, float]) ->
     return found
 
 
-def _find_bent(problem: FitProblem, state: FitState, model: Model) -> np.ndarray:
-    """`[K, R]` where windows are to begin anew, as the motion before is too far from linear."""
+def _look_around(
+    problem: FitProblem, state: FitState, model: Model
+) -> tuple[Point | None, np.ndarray]:
+    """What lies one or two standard deviations of each number away, the others at rest.
+
+    Returns:
+        The best point there, if it is better than the state's, and `[K, R]` where windows are to
+        begin anew, as the motion before is too far from linear.
+    """
     count, resets = len(problem.parameters), problem.drive.resets
     system = normal_equations(problem, model, state.point, state.noise)
-    matrix = system.matrix.copy()
-    matrix[:count, :count] += prior_matrix(problem)
-    covariance = np.linalg.inv(matrix)
+    covariance = np.linalg.inv(with_prior(problem, system))
     at_rest = system._replace(starts=[(*x[:4], 0 * x[4]) for x in system.starts])
     points = []
     for k in range(count):
-        move = _AWAY * covariance[:, k] / np.sqrt(covariance[k, k])
+        move = covariance[:, k] / np.sqrt(covariance[k, k])
         # The commands' clock is the first point's.
         move[count:] = np.where(np.tile([n == "clock" for n in problem.local], len(resets[0])),
                                 0.0, move[count:])  # fmt: skip
-        points += [reach(problem, state.point, at_rest, x, 0.0 * resets) for x in (move, -move)]
+        points += [
+            reach(problem, state.point, at_rest, far * move, 0.0 * resets)
+            for far in (_AWAY, -_AWAY, 1.0, -1.0)
+        ]
     bent = np.zeros(resets.shape)
+    windows, prior = costs_of(problem, state.point, model.values, state.noise)
+    lowest, best = float(windows.sum()) + prior - _LOWER, None
     room = problem.lanes
     for first in range(0, len(points), room):
         some = points[first : first + room]
         left = problem.residuals(problem.simulate(some))
+        for i, point in enumerate(some):
+            windows, prior = costs_of(problem, point, [x[i] for x in left], state.noise)
+            if float(windows.sum()) + prior < lowest:
+                lowest, best = float(windows.sum()) + prior, point
         for channel, values, slopes, off in zip(
             problem.channels, model.values, model.slopes, left, strict=True
         ):
@@ -369,7 +404,7 @@ def _find_bent(problem: FitProblem, state: FitState, model: Model) -> np.ndarray
                 square = np.nansum(square, 1) * channel.fitted
                 own = np.bincount(where, square, len(bent))
                 bent[:, r] = np.maximum(bent[:, r], own)
-    return middles(resets, bent > _BENT, problem.short)
+    return best, middles(resets, bent > _BENT, problem.short)
 
 
 def middles(resets: np.ndarray, chosen: np.ndarray, short: np.ndarray) -> np.ndarray:
@@ -383,14 +418,27 @@ def middles(resets: np.ndarray, chosen: np.ndarray, short: np.ndarray) -> np.nda
     return found
 
 
+def _go_on(problem: FitProblem, state: FitState, model: Model) -> tuple[FitState, Model]:
+    """A search that has arrived goes on from a better place, or with windows that are cut."""
+    better, cut = _look_around(problem, state, model)
+    state = replace(state, damping=0 * state.damping, common=0.0)
+    if better is not None:
+        state = replace(state, point=better)
+    elif cut.any():
+        problem.drive.resets[cut] = True
+    else:
+        return replace(state, inflated=True), model
+    return state, linearize(problem, state.point, state.steps)
+
+
 def advance(problem: FitProblem, state: FitState, model: Model) -> tuple[FitState, Model]:
     """One step of the search; the damping grows until a step lowers the cost."""
-    if not state.inflated and state.moved < _TOLERANCE:
-        cut = _find_bent(problem, state, model)
-        state = replace(state, inflated=not cut.any(), damping=0 * state.damping, common=0.0)
-        if cut.any():
-            problem.drive.resets[cut] = True
-            model = linearize(problem, state.point)
+    if state.steps is None and state.moved < _NEAR:
+        system = normal_equations(problem, model, state.point, state.noise)
+        state = replace(state, steps=_spreads(problem, system))
+        model = linearize(problem, state.point, state.steps)
+    elif not state.inflated and state.moved < _TOLERANCE:
+        state, model = _go_on(problem, state, model)
     system = normal_equations(problem, model, state.point, state.noise)
     plain = estimate_noise(problem, model.values, numbers_used(problem, system))
     # What errs together counts once: the prior then holds where the model errs, and not the frames.
@@ -401,10 +449,11 @@ def advance(problem: FitProblem, state: FitState, model: Model) -> tuple[FitStat
     system = normal_equations(problem, model, state.point, noise)
     windows, prior = costs_of(problem, state.point, model.values, noise)
     now = float(windows.sum()) + prior
-    state = replace(state, noise=noise, cost=now)
+    steps = None if state.steps is None else _spreads(problem, system)
+    state = replace(state, noise=noise, cost=now, steps=steps)
     for _ in range(8):
         point, moved = step(problem, state, system)
-        tried = linearize(problem, point)
+        tried = linearize(problem, point, state.steps)
         others, prior = costs_of(problem, point, tried.values, noise)
         cost = float(others.sum()) + prior
         better = others <= windows + 1.0

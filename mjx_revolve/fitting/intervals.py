@@ -22,6 +22,7 @@ from mjx_revolve.fitting.estimate import (
     numbers_used,
     prior_matrix,
     reach,
+    with_prior,
 )
 from mjx_revolve.fitting.problem import FitProblem, Point
 
@@ -92,9 +93,7 @@ def estimate(problem: FitProblem, state: FitState, model: Model) -> Estimate:
     inflation = correlation(problem, model.values)
     noise = _widened(problem, model.values, state.noise)
     system = normal_equations(problem, model, state.point, noise)
-    whole = system.matrix.copy()
-    whole[:count, :count] += prior_matrix(problem)
-    covariance = np.linalg.inv(whole)
+    covariance = np.linalg.inv(with_prior(problem, system))
     rest = system.matrix[count:, count:]
     across = system.matrix[:count, count:]
     alone = system.matrix[:count, :count]
@@ -193,7 +192,7 @@ class _Profile:
         problem, best, quantile = self.problem, self.best, self.quantile
         windows, rest = costs_of(problem, best, self.model.values, self.noise)
         least = float(windows.sum()) + rest
-        covariance = np.linalg.inv(self.system.matrix + self._prior)
+        covariance = np.linalg.inv(with_prior(problem, self.system))
         linear = quantile * float(np.sqrt(covariance[k, k]))
         still = self.system._replace(starts=[(*x[:4], 0 * x[4]) for x in self.system.starts])
         move = covariance[:, k] * side * linear / covariance[k, k]
@@ -240,12 +239,6 @@ class _Profile:
         return best.free[k] + side * ahead
 
     @property
-    def _prior(self) -> np.ndarray:
-        prior, count = np.zeros_like(self.system.matrix), len(self.problem.parameters)
-        prior[:count, :count] = prior_matrix(self.problem)
-        return prior
-
-    @property
     def _undamped(self) -> np.ndarray:
         return np.zeros(self.problem.drive.resets.shape)
 
@@ -269,7 +262,7 @@ class _Profile:
         count = len(self.problem.parameters)
         model = replace(self.model, values=values)
         now = normal_equations(self.problem, model, point, self.noise)
-        matrix, slope = now.matrix + self._prior, now.slope.copy()
+        matrix, slope = with_prior(self.problem, now), now.slope.copy()
         slope[:count] -= prior_matrix(self.problem) @ point.free
         move, others = np.zeros(len(slope)), np.arange(len(slope)) != k
         move[others] = np.linalg.solve(matrix[np.ix_(others, others)], slope[others])

@@ -36,11 +36,13 @@ from mjx_revolve.inputs.schema import Integer, Number, checked
 # Records lie no further apart [s]: interpolation is then good to a millimetre and a tenth of a
 # degree.
 _RECORD = 0.01
-# Steps of the differences by which derivatives are found. A servo reaches its limit at one step of
-# time or at the next one, so that motions jump a little as numbers grow: over a ten-thousandth such
-# a jump may pass for a gradient. Free numbers are changed both ways by some hundredths, or a fifth
-# of what is not known of them; what is left of curvature is a ten-thousandth. Choices.
-_STEP, _FREE_STEP, _FREE_SHARE = 1e-3, 0.02, 0.2
+# Steps of the differences by which derivatives are found, and of the free numbers the widest and
+# the finest ones. A servo reaches its limit at one step of time or at the next one, so that motions
+# jump a little as numbers grow: over a ten-thousandth such a jump may pass for a gradient. Free
+# numbers are changed both ways: far from the solution by some hundredths, or a fifth of what is not
+# known of them, and near it by what they are uncertain by, as over more than that the motion of a
+# robot that tumbles is not linear, and its mean slope is another one. Choices.
+_STEP, _FREE_STEP, _FREE_SHARE, _FINEST = 1e-3, 0.02, 0.2, 1e-4
 # The search begins with windows that are so many times shorter: a robot that tumbles for seconds
 # leads a search that begins far from its numbers astray. A choice.
 _PARTS = 4
@@ -226,15 +228,22 @@ class FitProblem:
         still = replace(self, drive=replace(self.drive, later=np.zeros(self.lanes, bool)))
         return still._simulate(robots, padded)[: len(points)]
 
-    def linearize(self, point: Point) -> tuple[list[np.ndarray], list[np.ndarray], np.ndarray]:
+    def linearize(
+        self, point: Point, steps: np.ndarray | None = None
+    ) -> tuple[list[np.ndarray], list[np.ndarray], np.ndarray]:
         """Residuals and their derivatives.
+
+        Args:
+            point: where.
+            steps: `[P]` of the differences, within bounds; None: the widest ones.
 
         Returns:
             For each channel `[n, d]` residuals, `[n, d, P + L + 12]` derivatives, and the track
             `[R, K, records, 13 + hinges]`.
         """
         count, own = len(self.parameters), len(self.local)
-        steps = np.minimum(_FREE_STEP, [_FREE_SHARE * p.spread for p in self.parameters])
+        widest = np.minimum(_FREE_STEP, [_FREE_SHARE * p.spread for p in self.parameters])
+        steps = widest if steps is None else np.clip(steps, _FINEST, widest)
         frees = [point.free, *(point.free + np.diag(steps)), *(point.free - np.diag(steps))]
         points = [replace(point, free=free) for free in frees]
         robots = [with_values(self.robot, self.parameters, free) for free in frees]

@@ -29,12 +29,15 @@ from mjx_revolve.inputs.yaml_reader import load_yaml
 _UNITS = {"_m": 1.0, "_cm": 1e-2, "_mm": 1e-3, "_s": 1.0, "_ms": 1e-3, "_us": 1e-6, "_ns": 1e-9,
           "_rad": 1.0, "_deg": math.pi / 180}  # fmt: skip
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz", "roll", "pitch", "yaw", "depth", "mean_speed")
+_PLACE = ("x", "y", "z")
 _SENSED = tuple(f"{kind}.{axis}" for kind in ("gyro", "accel") for axis in "xyz")
 _SOURCE = re.compile(r"^(?P<column>.*?)(?:\*(?P<factor>[-+0-9.eE]+))?$")
 # Faster than any robot of modules swims [body lengths/s]; wrong units are beyond it. A choice.
 _FASTEST = 30.0
 # And turns so fast [rad/s]: twice a second, noise of frames with it; degrees are beyond. A choice.
 _FASTEST_TURN = 4 * math.pi
+# A wild frame or two are weighted down; so many frames later what has jumped stays away. A choice.
+_STAYS = 5
 # A gap is longer than so many usual frames; one of two is a dropped frame. A choice.
 _GAP = 2.5
 
@@ -468,11 +471,19 @@ def _check_signals(
 
 
 def _check_motion(signals: Mapping[str, TimeSeries], robot: Robot) -> None:
-    """Refuses what is too fast for its units, and what does not move at all."""
-    length = _length(robot)
+    """Refuses what is too fast for its units, jumps, flies, and what does not move at all."""
+    length, top = _length(robot), robot.world.surface_height
+    for name in (n for n in signals if n == "z" or (n.startswith("mark.") and n.endswith(".z"))):
+        middle = float(np.median(signals[name].value))
+        if middle > top + length:
+            raise InputError(
+                f"{name}: expected heights of a robot in water, below {top:g} m; found {middle:.3g}"
+                f" m: does z point down (--map {name}=COLUMN*-1), or begin elsewhere (--set "
+                "world.surface_height=HEIGHT)?"
+            )
     still = "mean_speed" not in signals
     for name, signal in signals.items():
-        if not (name in ("x", "y") or name.startswith("mark.")) or len(signal.time) < 3:
+        if not (name in _PLACE or name.startswith("mark.")) or len(signal.time) < 3:
             continue
         # Between quantiles: single frames may be wrong.
         speed = float(np.quantile(np.abs(np.diff(signal.value) / np.diff(signal.time)), 0.75))
@@ -482,6 +493,9 @@ def _check_motion(signals: Mapping[str, TimeSeries], robot: Robot) -> None:
                 f"{speed:.3g} a second: millimetres or pixels? (--map {name}=COLUMN*FACTOR, or a "
                 "column that ends in _mm)"
             )
+        _check_jump(name, signal, length)
+        if name == "z":
+            continue
         jitter = float(np.median(np.abs(np.diff(signal.value, 2)))) / 2
         still = still and float(np.ptp(signal.value)) < max(12 * jitter, 2e-3 * length)
     for name in ("yaw", "qz", "qx"):
@@ -491,6 +505,20 @@ def _check_motion(signals: Mapping[str, TimeSeries], robot: Robot) -> None:
         raise InputError(
             "expected a robot that moves; found nothing that moves more than its noise"
         )
+
+
+def _check_jump(name: str, signal: TimeSeries, length: float) -> None:
+    """Refuses a coordinate that goes elsewhere between two frames, and stays there."""
+    time, value = signal
+    step, bound = np.diff(value), length * (1 + _FASTEST * np.diff(time))
+    for k in np.flatnonzero(np.abs(step) > bound) + 1:
+        before, after = value[max(k - _STAYS, 0) : k], value[k : k + _STAYS]
+        away = abs(np.median(after) - np.median(before)) > bound[k - 1]
+        if away and min(len(before), len(after)) > _STAYS / 2:
+            raise InputError(
+                f"{name}: expected a way without jumps; found one of {abs(step[k - 1]):.3g} m at "
+                f"{time[k]:g} s: another origin, or another robot, from there on?"
+            )
 
 
 def _length(robot: Robot) -> float:

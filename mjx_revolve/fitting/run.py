@@ -211,8 +211,18 @@ class FitRun:
         resets[:] = arrays.get("resets", resets)  # folders of older versions have no cut windows
         point = Point(arrays["free"], arrays["local"], arrays["starts"])
         names = ("common", "generation", "cost", "moved", "inflated")
-        rest = (meta[name] for name in names)
-        self.state = FitState(point, meta["noise"], arrays["damping"], *rest)
+        common, iteration, cost, moved, inflated = (meta[name] for name in names)
+        self.state = FitState(
+            point,
+            meta["noise"],
+            arrays["damping"],
+            common,
+            iteration,
+            cost,
+            moved,
+            inflated,
+            arrays.get("steps"),
+        )
 
     def save(self) -> None:
         """A checkpoint of the state."""
@@ -222,6 +232,8 @@ class FitRun:
         arrays = {"free": point.free, "local": point.local, "starts": point.starts,
                   "damping": state.damping, "roots": self.problem.roots,
                   "resets": self.problem.drive.resets}  # fmt: skip
+        if state.steps is not None:
+            arrays["steps"] = state.steps
         meta = {"noise": state.noise, "common": state.common, "cost": state.cost,
                 "moved": min(state.moved, 1e30), "inflated": state.inflated}  # fmt: skip
         self.folder.save_checkpoint(state.iteration, arrays, meta, 2)
@@ -232,7 +244,7 @@ class FitRun:
         if self.state is None:
             self.state = begin(self.problem, self.request.seed)
             self.save()
-        self.model = linearize(self.problem, self.state.point)
+        self.model = linearize(self.problem, self.state.point, self.state.steps)
         progress = _Progress(self.state.iteration, total, unit="iteration")
         try:
             while not is_done(self.problem, self.state):

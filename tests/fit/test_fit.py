@@ -291,7 +291,10 @@ BAD = {
 "still": (changed(x=np.ones(60), y=np.ones(60), yaw=np.zeros(60)), "a robot that moves"),
 "no place": (changed(x=None, y=None), "expected x and y of the core, marks, or mean_speed"),
 "semicolons": ("time;x;y\n0;1;2\n1;2;2\n", "commas between them; found semicolons"),
-"degrees": (changed(yaw=25 * np.arange(60.0)), "yaw: expected radians; found steps of 500 a")
+"degrees": (changed(yaw=25 * np.arange(60.0)), "yaw: expected radians; found steps of 500 a"),
+"a jump": (changed(x=0.2 * np.arange(60) / 20 + 5.0 * (np.arange(60) > 30)),
+           "x: expected a way without jumps; found one of 5.01 m at 1.55 s"),
+"in the air": (changed(z=np.full(60, 1.5)), "does z point down (--map z=COLUMN*-1)"),
 }  # fmt: skip
 
 

@@ -1,6 +1,7 @@
 """Fits from each kind of recording, by the command: what is read is what was there."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from mjx_revolve import fit as command
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.fitting import TimeSeries, make_noisy, run, simulate_signals
+from mjx_revolve.fitting.axes import find_other_axes
+from mjx_revolve.fitting.problem import FitSettings, make_problem
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.water.world import load_world
 
@@ -50,6 +53,18 @@ def fit(auv, tmp_path, monkeypatch):
         return json.loads((tmp_path / "out" / "fit.json").read_text())
 
     return go
+
+
+def test_a_quaternion_of_another_order_is_named(auv, signals):
+    recording = make_noisy(signals, rate=40)
+    order = {"qw": "qx", "qx": "qy", "qy": "qz", "qz": "qw"}
+    other = {name: recording.signals[source] for name, source in order.items()}
+    shuffled = replace(recording, signals={**recording.signals, **other})
+    settings = FitSettings(held_out=0.0)
+    for known, words in ((recording, []), (shuffled, [recording.name])):
+        lines = find_other_axes(make_problem(auv, [known], FREE, settings))
+        assert [line.partition(":")[0] for line in lines] == words
+        assert all("qw, qx, qy, qz hold x, y, z, w" in line for line in lines)
 
 
 def check(found, within=0.03):
