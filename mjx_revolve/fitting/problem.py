@@ -41,7 +41,7 @@ _RECORD = 0.01
 # jump a little as numbers grow: over a ten-thousandth such a jump may pass for a gradient. Free
 # numbers are changed both ways: far from the solution by some hundredths, or a fifth of what is not
 # known of them, and near it by what they are uncertain by, as over more than that the motion of a
-# robot that tumbles is not linear, and its mean slope is another one. Choices.
+# robot that tumbles is not linear, and its mean gradient is another one. Choices.
 _STEP, _FREE_STEP, _FREE_SHARE, _FINEST = 1e-3, 0.02, 0.2, 1e-4
 # The search begins with windows that are so many times shorter: a robot that tumbles for seconds
 # leads a search that begins far from its numbers astray. A choice.
