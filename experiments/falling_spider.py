@@ -4,8 +4,8 @@
 
 The thesis recorded the height of Revolve's spider in Gazebo every 0.2 s and read the acceleration
 off the speeds. Its drag was in effect off, so our runs beside it have drag and added mass off, too;
-two more show what partial submersion and the default water change. Everything is computed in
-float64: over a fall of 100 m, rounding in float32 costs 1e-4 m/s².
+two more show what partial submersion, and drag by faces with added mass, change. Everything is
+computed in float64: over a fall of 100 m, rounding in float32 costs 1e-4 m/s².
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ RUNS: dict[str, tuple[dict[str, object], float]] = {
     "air": ({"buoyancy": "off", "drag": "off", "added_mass": False}, 4.4),
     "mask": ({"buoyancy": "mask", "drag": "off", "added_mass": False}, 14.8),
     "partial": ({"buoyancy": "partial", "drag": "off", "added_mass": False}, 14.8),
-    "default": ({}, 14.8),
+    "faces": ({"drag": "faces"}, 14.8),
 }
 
 
@@ -300,13 +300,13 @@ class Still:
 
 
 def read_tables() -> Still:
-    """Closed forms of the default water from the spider's fluid table."""
+    """Closed forms, drag by faces, from the spider's fluid table."""
     import mujoco
 
     from mjx_revolve import build_robot, load_morphology, load_world
     from mjx_revolve.water.face_drag import FACES
 
-    world = load_world("empty_underwater", gravity=GRAVITY)
+    world = load_world("empty_underwater", gravity=GRAVITY, drag="faces")
     robot = build_robot(load_morphology(ROOT / "morphologies" / "spider.yaml"), world)
     data = mujoco.MjData(robot.mj_model)
     mujoco.mj_kinematics(robot.mj_model, data)
@@ -348,8 +348,8 @@ def table(
         acceleration(falls["mask"]), wet, "m/s2")  # fmt: skip
     add("partial submersion, no drag: acceleration", "-", "",
         acceleration(falls["partial"]), wet, "m/s2")  # fmt: skip
-    speed = -float(falls["default"].speed[-1])
-    add("default water: speed at the end", "-", "", speed, still.terminal, "m/s")
+    speed = -float(falls["faces"].speed[-1])
+    add("drag by faces: speed at the end", "-", "", speed, still.terminal, "m/s")
     return rows
 
 
@@ -382,7 +382,7 @@ def remarks(still: Still, readings: dict[str, Reading] | None) -> list[str]:
         "Partial submersion falls like the mask: it does the same work on the way through the "
         "surface. The mask can only switch between two steps, which at the speed of entry are "
         f"{1e3 * form.entry_speed * 0.005:.0f} mm apart.",
-        f"Default water: drag ends the fall at {still.terminal:.4f} m/s, and with the carried "
+        f"Drag by faces ends the fall at {still.terminal:.4f} m/s, and with the carried "
         f"water to move it would start from rest at {still.start:.3f} m/s2, not {form.wet:.3f}.",
     ]
     return lines
@@ -397,7 +397,7 @@ _STYLES: dict[str, dict[str, Any]] = {
         "color": _DEEP, "linewidth": 1.6, "linestyle": (0, (4, 3)),
         "label": "partial submersion, no drag",
     },
-    "default": {"color": "#2a9d6f", "linewidth": 1.8, "label": "default water"},
+    "faces": {"color": "#2a9d6f", "linewidth": 1.8, "label": "drag by faces"},
 }  # fmt: skip
 
 
@@ -524,8 +524,8 @@ def main(argv: list[str] | None = None) -> int:
     write_csv(folder / "falls.csv", falls)
     if options.results:
         dry = {name: acceleration(falls[name]) for name in ("air", "mask", "partial")}
-        last = {"speed_m_s": -float(falls["default"].speed[-1]), "terminal_m_s": still.terminal}
-        write_results("falling_spider", {"accelerations": dry, "default": last}, ())
+        last = {"speed_m_s": -float(falls["faces"].speed[-1]), "terminal_m_s": still.terminal}
+        write_results("falling_spider", {"accelerations": dry, "faces": last}, ())
     print(f"\nwritten: falls.png and falls.csv in {short_path(folder)}")
     return 0
 
