@@ -695,3 +695,23 @@ def test_a_body_is_sent_small_and_whole(tmp_path):
     assert again.modules[1].kind == flipper and again.modules[0].kind.mass == 0.1
     assert "volume" not in vars(again.modules[0].kind)
     assert not again.modules[2].position.flags.writeable
+
+
+def test_equality_sees_every_field(tmp_path):
+    base = (
+        "id: a\nbody: {type: Core, id: c, params: {ballast: 1}, children: {1: {type: FixedBrick}}}"
+    )
+    robot = read(tmp_path, base)
+    assert robot == read(tmp_path, base)
+    assert robot != 1
+    for old, new in [
+        ("id: a", "id: b"),
+        ("id: c", "id: d"),
+        ("ballast: 1", "ballast: 2"),
+        ("{1: {type: F", "{2: {type: F"),
+        ("FixedBrick", "ActiveHinge"),
+        ("FixedBrick", "FixedBrick, orientation: 90"),
+        ("FixedBrick", "FixedBrick, params: {red: 1, green: 1, blue: 1}"),
+        ("\nbody", "\nbrain: {}\nbody"),
+    ]:
+        assert robot != read(tmp_path, base.replace(old, new))

@@ -163,3 +163,15 @@ def test_the_guides_table_of_sensors_is_the_codes():
             f"| `{name}` | {len(kind.parts)} | {kind.unit} | {kind.where} | {reach} | {kind.what} |"
         )
         assert row in GUIDE
+
+
+def test_noise_belongs_to_the_hinge_not_to_its_row():
+    def noise(order):
+        number = np.array(order, np.int32)[:, None]
+        observer = make_observer([Sensor(type="angle", noise=0.1)], DT)
+        angle = jnp.zeros((3, 4))
+        sense = SensorReadings(0.0, 0.0, (), (), angle=angle, noise=jnp.arange(4, dtype=jnp.uint32))
+        return np.asarray(observer.observe((), jnp.array(0.5), sense, number)[1].joint[0])
+
+    assert np.array_equal(noise([2, 0, 1])[[1, 2, 0]], noise([0, 1, 2]))
+    assert len(np.unique(noise([0, 1, 2]))) == 12

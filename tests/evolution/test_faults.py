@@ -12,9 +12,11 @@ import pytest
 import toys
 from laboratory import ROOT, XLA_FLAGS
 from mjx_revolve import evolve
+from mjx_revolve.episodes.config import load_config
 from mjx_revolve.evolution import memory
 from mjx_revolve.evolution.run_folder import RunFolder  # noqa: F401  (the script names it)
 from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
 
 
 @pytest.fixture
@@ -133,6 +135,15 @@ def test_the_largest_population_fits(tmp_path, folder, monkeypatch):
             else:
                 with pytest.raises(ValueError, match=f"at most {most},"):
                     memory.check_memory(config_of(strategy, most + 1), 5)
+
+
+def test_bodies_beyond_the_memory_are_refused(folder, monkeypatch):
+    toys.write_bodies_config(folder / "bodies.yaml")
+    monkeypatch.setattr(memory, "free_memory", lambda: 10_000_000)
+    memory.check_memory(load_config("bodies.yaml"), 5)
+    for place in ("evolution.population_size", "bodies.selection.offspring"):
+        with pytest.raises(InputError, match=f"{place}: expected at most [1-9]"):
+            memory.check_memory(load_config("bodies.yaml", {place: 5000}), 5)
 
 
 def config_of(strategy, size):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mjx_revolve.episodes.bodies_config import SelectionConfig
-from mjx_revolve.evolution.novelty import novelty
+from mjx_revolve.evolution.novelty import axis_scale, novelty
 from mjx_revolve.evolution.selection import (
     SCHEMES,
     Candidates,
@@ -215,3 +215,10 @@ def test_novelty_is_the_mean_distance_to_the_nearest():
     assert novelty(points[:1], others[:0], 3, np.ones(2)).tolist() == [0.0]
     # An equal point is a neighbour; the point itself is none.
     assert novelty(points[[0, 0]], others[:0], 1, np.ones(2)).tolist() == [0.0, 0.0]
+
+
+def test_axis_scale():
+    points = np.array([[1, 0.1, 5], [3, 0.1, 5], [NAN, 0, 0]])
+    assert axis_scale(points).tolist() == [1.0, 1.0, 1.0]
+    assert axis_scale(np.array([[0.0], [6.0]])).tolist() == [3.0]
+    assert axis_scale(points[2:]).tolist() == [1.0, 1.0, 1.0]
