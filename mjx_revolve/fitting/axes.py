@@ -13,8 +13,7 @@ from mjx_revolve.fitting.estimate import recording_costs
 from mjx_revolve.fitting.problem import NOISE, FitProblem, make_problem
 from mjx_revolve.fitting.recording import TimeSeries
 
-# Another way is named where it leaves a third of the sum of squares. A choice: a coefficient that
-# is wrong by a factor of two does less in a second.
+# Another way is named where it leaves a third of the sum of squares. A choice.
 _BETTER = 3.0
 # Signals that another way takes from another one, with the sign.
 _WAYS: dict[str, dict[str, tuple[str, float]]] = {

@@ -38,6 +38,8 @@ _FASTEST = 30.0
 _FASTEST_TURN = 4 * math.pi
 # A wild frame or two are weighted down; so many frames later what has jumped stays away. A choice.
 _STAYS = 5
+# Commands are sampled, and not as sent, where this share of them is of frames and is new. A choice.
+_SAMPLED = 0.6
 # A gap is longer than so many usual frames; one of two is a dropped frame. A choice.
 _GAP = 2.5
 
@@ -467,7 +469,8 @@ def _check_signals(
                     f"(--map {name}=COLUMN*0.01745, or a column that ends in _deg)"
                 )
     _check_motion(signals, robot)
-    return signals, _gaps({n: signals[n] for n in seen})
+    frames = {n: signals[n] for n in seen}
+    return signals, [*_gaps(frames), *_sampled_commands(signals, frames, robot)]
 
 
 def _check_motion(signals: Mapping[str, TimeSeries], robot: Robot) -> None:
@@ -525,6 +528,28 @@ def _length(robot: Robot) -> float:
     from mjx_revolve.engine.plant import body_geometry
 
     return float(body_geometry(robot).length)
+
+
+def _sampled_commands(
+    signals: Mapping[str, TimeSeries], frames: Mapping[str, TimeSeries], robot: Robot
+) -> list[str]:
+    """A note where hinges' commands are known at the frames only, and go on in between."""
+    seen = np.unique(np.concatenate([time for time, _ in frames.values()]))
+    for module in robot.morphology.modules:
+        command = signals.get(f"command.{module.name}")
+        if module.kind.hinge is None or command is None or len(command.time) < 3:
+            continue
+        time, value = command
+        usual = float(np.median(np.diff(time)))
+        at_frames = float(np.isin(time, seen).mean())
+        changes = float((np.diff(value) != 0).mean())
+        if usual > 2 * robot.world.timestep and min(at_frames, changes) > _SAMPLED:
+            return [
+                f"commands go on changing from frame to frame, at {1 / usual:.3g} Hz, and each is "
+                "held until the next one: if the robot was sent more of them, record those, or "
+                "its servos' speed and added mass are biased"
+            ]
+    return []
 
 
 def _gaps(signals: Mapping[str, TimeSeries]) -> list[str]:

@@ -356,6 +356,21 @@ def test_units_gaps_and_factors_of_columns(auv, tmp_path):
     )
 
 
+@pytest.mark.parametrize(
+    ("wave", "rate", "noted"),
+    [(np.sin, 30, True), (np.sin, 200, False), (lambda t: np.floor(t / 2) % 2, 30, False)],
+    ids=["sampled", "as sent", "steps"],
+)
+def test_commands_that_are_known_at_the_frames_only_are_noted(tmp_path, wave, rate, noted):
+    robot = build_robot(load_morphology("spider"), load_world("lake", bed="off"))
+    time = np.arange(6 * rate) / rate
+    seen = {"x": 0.2 * time, "y": 0.1 * np.sin(time), "z": 0 * time - 1, "yaw": 0.1 * time}
+    seen["command.left_hip"] = 0.5 * wave(5 * time)
+    write_csv(tmp_path / "swim.csv", {"time": time} | seen)
+    notes = load_recording(tmp_path / "swim.csv", robot, {}).notes
+    assert any(f"at {rate} Hz" in note and "held until" in note for note in notes) == noted
+
+
 def test_prescribed_hinges_follow_what_was_measured():
     robot = build_robot(load_morphology("spider"), load_world("lake", bed="off"))
     time = np.arange(0, 2, 0.02)
