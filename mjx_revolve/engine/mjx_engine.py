@@ -243,8 +243,8 @@ class MjxEngine:
     def contact_force(
         self, state: MjxState, water: Water, wrench: Any = ()
     ) -> Float[Array, "bodies lanes"]:
-        """Force of the bed on each rigid body; see `forces.contact_force`."""
-        rows = forces.contact_force(self.tree, self._state(state), water)
+        """Force of contacts on each rigid body; see `forces.contact_force`."""
+        rows = forces.contact_force(self.tree, self._state(state), water, wrench)
         return self._own_order(rows, state.qpos[0])
 
     def contact_by_half(

@@ -65,7 +65,7 @@ _ROUNDS, _TURN = 3, 0.01
 # sweep is exact for one contact.
 _SWEEPS, _ENOUGH = 30, 2e-5
 # Added to the inverse mass of a contact [1/kg], so that what is wedged between two modules has
-# finite forces. A choice: as if 50 kg gave way, where modules have some tens of grams.
+# finite forces. A choice: as if 500 kg gave way, where modules have some tens of grams.
 _SOFTNESS = 0.002
 
 
@@ -200,8 +200,8 @@ def _settle(
     found = [contacts.acceleration(), clear[None]]
     if contacts.ends is not None:
         row = jnp.arange(felt, dtype=steps.dtype)[:, None]
-        ends = [contacts.ends[:, k] for k in range(contacts.ends.shape[1])]
-        ends = [x + (bodies if k > 1 else 0) for k, x in enumerate(ends)]
+        # Halves of modules stand behind the bodies.
+        ends = [contacts.ends[:, k] + bodies * (k > 1) for k in range(contacts.ends.shape[1])]
         at = lambda k: _sum([weight(row == x[k], steps) for x in ends])  # noqa: E731
         found.append(_sum([contacts.force[k] * at(k) for k in range(_MOST)]))
     return jnp.concatenate(found)
