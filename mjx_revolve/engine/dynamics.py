@@ -202,7 +202,7 @@ class _Factors(NamedTuple):
 def _look_at(
     tree: Tree, factors: _Factors, steps: Any, hurry: Any, drift: jax.Array, which: jax.Array
 ) -> Robots:
-    """Some of the robots; see there."""
+    """The robots in the lanes `which`, as contacts look at them."""
     few, places = tree.at_lanes(which), tree.hinge_positions(which)
     turns = tree.saved_at_lanes(factors.moved, lambda moved: moved[1], which)
     own, faster = jax.tree.map(lambda x: take_lanes(x, which), (steps, hurry))
