@@ -170,8 +170,7 @@ def _read_sensors(value: object, source: str) -> tuple[Sensor, ...] | None:
     """The sensors of a robot; None if the file has no such key."""
     if value is None:
         return None
-    found: tuple[Sensor, ...] = read(SensorRow, value, f"{source}: sensors")
-    return found
+    return read(SensorRow, value, f"{source}: sensors")
 
 
 def _check_known(item: Mapping[object, object], known: tuple[str, ...], place: str) -> None:

@@ -81,8 +81,7 @@ def _make(name: str, plant: Plant, settings: Any) -> Controller:
     kind = CONTROLLERS[name]
     takes = inspect.signature(kind.make).parameters
     given = {key: value for key, value in settings if key in takes}
-    made: Controller = kind.make(plant, **given, **kind.fixed)
-    return made
+    return kind.make(plant, **given, **kind.fixed)
 
 
 def _make_brain(plant: Plant, settings: Any, source: str, body: Morphology | None) -> Controller:

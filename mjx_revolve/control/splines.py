@@ -85,8 +85,7 @@ def _weight(way: Any, points: int, xp: Any) -> Any:
 def _weights_of(places: np.ndarray, points: int) -> np.ndarray:
     """`[places, points]` weights of the coefficients at positions along the closed curve."""
     away: np.ndarray = np.subtract.outer(places, np.arange(points))
-    found: np.ndarray = _weight(away, points, np)
-    return found
+    return _weight(away, points, np)
 
 
 def refine_splines(genes: np.ndarray, points: int, more: int) -> np.ndarray:

@@ -25,8 +25,7 @@ class ControllerKind(NamedTuple):
     def make(self) -> Callable[..., Any]:
         """The function."""
         module, name = self.path.split(".")
-        made: Callable[..., Any] = getattr(import_module(f"mjx_revolve.control.{module}"), name)
-        return made
+        return getattr(import_module(f"mjx_revolve.control.{module}"), name)
 
 
 _NETWORK = "joint_network.make_joint_network", ("sensors", "hidden", "messages")

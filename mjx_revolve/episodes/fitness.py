@@ -125,9 +125,7 @@ class Fitness(EpisodeSpec[tuple[()]]):
                 is none.
         """
         population = self.check_population(population)
-        found: tuple[jax.Array, dict[str, jax.Array]]
-        found = self.program(population, key)((), population, key)
-        return found
+        return self.program(population, key)((), population, key)
 
     def bare_controller(self) -> Controller:
         """The controller for a real device: called at its rate, with readings of real sensors.
@@ -357,7 +355,6 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
         if count != len(population):
             raise InputError(f"robots: expected {len(population)}, one each; found {count}")
         bodies = robots if isinstance(robots, PackedBodies) else self.pack(robots)
-        found: tuple[jax.Array, dict[str, jax.Array]]
         found = self.program(population, key)(bodies, population, key)
         return jax.tree.map(lambda x: x[0], found) if single else found
 

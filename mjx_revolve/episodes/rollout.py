@@ -276,8 +276,7 @@ class Rollout:
         def detect(state: PyTree, neighbours: PyTree) -> tuple[InteractionForces, PyTree]:
             if interaction is None:
                 return NO_INTERACTION, neighbours
-            found: tuple[InteractionForces, PyTree] = interaction.detect(state, neighbours)
-            return found
+            return interaction.detect(state, neighbours)
 
         if self.engine.elementwise and not differentiable:
             first = jax.tree.map(lambda x: x[0], inputs)

@@ -94,8 +94,7 @@ def advance_taped(
             return wide_leaves(unpack((block, packed[1]))[0].controller_state)
 
         _, pull = jax.vjp(act, values)
-        found: list[jax.Array] = pull((jax.vmap(states)(after, path), offset))[0]
-        return found
+        return pull((jax.vmap(states)(after, path), offset))[0]
 
     def pull(by_kept: PyTree) -> tuple[RolloutState, list[jax.Array]]:
         def retreat(carried: PyTree, given: PyTree) -> tuple[PyTree, None]:

@@ -48,8 +48,7 @@ def find_other_axes(problem: FitProblem) -> list[str]:
     free = [*(p.name for p in problem.parameters), *sorted(local)]
 
     def cost(one: FitProblem) -> list[float]:
-        found: list[float] = recording_costs(one.in_pieces(), [one.origin()], NOISE)[0].tolist()
-        return found
+        return recording_costs(one.in_pieces(), [one.origin()], NOISE)[0].tolist()
 
     best = [(x / _BETTER, "") for x in cost(problem)]
     for words, way in _WAYS.items():

@@ -41,8 +41,7 @@ class Unknown(NamedTuple):
 def scaled(parameters: Sequence[Parameter], information: np.ndarray) -> np.ndarray:
     """`[P, P]` information of the data over the priors'."""
     spread = np.array([p.spread for p in parameters])
-    found: np.ndarray = spread[:, None] * information * spread
-    return found
+    return spread[:, None] * information * spread
 
 
 def find_unknown(parameters: Sequence[Parameter], information: np.ndarray) -> list[Unknown]:

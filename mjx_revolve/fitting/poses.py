@@ -40,12 +40,10 @@ class MarkPoints:
         """`[n, marks, 3]` in the world, of `[n, nq]` poses [m]."""
         if np.all(self.body == 1):
             turn = Rotation.from_quat(qpos[:, 3:7], scalar_first=True).as_matrix()
-            found: np.ndarray = qpos[:, None, :3] + np.einsum("nij,mj->nmi", turn, self.offset)
-            return found
+            return qpos[:, None, :3] + np.einsum("nij,mj->nmi", turn, self.offset)
         place, turns = (np.asarray(x) for x in body_poses(self.robot, qpos))  # type: ignore[arg-type]
         turned = np.einsum("nmij,mj->nmi", turns[:, self.body], self.offset)
-        moved: np.ndarray = place[:, self.body] + turned
-        return moved
+        return place[:, self.body] + turned
 
     def on_core(self, angles: np.ndarray) -> np.ndarray:
         """`[n, marks, 3]` in the core's frame, of `[n, hinges]` angles [rad]."""

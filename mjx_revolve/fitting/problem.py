@@ -306,8 +306,7 @@ class FitProblem:
         passed = (time - self.begin[recording]) / self.piece
         k = np.clip(np.ceil(passed - 1e-9).astype(int) - 1, 0, len(self.roots) - 1)
         begun = np.where(self.drive.resets[:, recording], np.arange(len(self.roots)), 0)
-        found: np.ndarray = np.maximum.accumulate(begun)[k]
-        return found
+        return np.maximum.accumulate(begun)[k]
 
 
 def _moved(roots: np.ndarray, shift: np.ndarray) -> np.ndarray:
@@ -494,8 +493,7 @@ def _held(
         t = edges + late
         inside = np.interp(t, time, area) + value[-1] * np.maximum(t - time[-1], 0)
         inside += value[0] * np.minimum(t - time[0], 0)
-        found: np.ndarray = np.diff(inside) / dt
-        return found
+        return np.diff(inside) / dt
 
     return mean
 
@@ -688,5 +686,4 @@ def _turn_error(quat: np.ndarray, seen: np.ndarray, level: bool) -> np.ndarray:
     if level:
         yaw = 2 * np.arctan2(imaginary[..., 2], real)
         return ((yaw + np.pi) % (2 * np.pi) - np.pi)[..., None]
-    found: np.ndarray = 2 * imaginary * np.sign(real)[..., None]
-    return found
+    return 2 * imaginary * np.sign(real)[..., None]

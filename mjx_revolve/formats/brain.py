@@ -235,8 +235,7 @@ def _blank_readings(plant: Plant, signals: Sequence[str], seen: bool) -> SensorR
 
     def blank(sense: SensorReadings) -> SensorReadings:
         own = sense._replace(seen=np.ones(1, bool) if seen else None, present=None, modules=None)
-        found: SensorReadings = jax.tree.map(lambda x: np.zeros_like(_wide(x)), own)
-        return found
+        return jax.tree.map(lambda x: np.zeros_like(_wide(x)), own)
 
     readings = readings_at_rest(plant, 1, signals)
     modules = {name: blank(own) for name, own in (readings.modules or {}).items()}

@@ -383,8 +383,7 @@ def _sliced(grids: Any, params: Any, out: tuple[int, ...]) -> np.ndarray:
         params["strides"] or [1] * len(out),
         strict=True,
     )
-    found: np.ndarray = grids[0][tuple(slice(*end) for end in ends)]
-    return found
+    return grids[0][tuple(slice(*end) for end in ends)]
 
 
 # The frequent ones by NumPy, as JAX would compile each.

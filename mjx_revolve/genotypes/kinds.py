@@ -41,8 +41,7 @@ def find_genotype(
     if name in GENOTYPES:
         module, function = GENOTYPES[name].split(".")
         make = getattr(import_module(f"mjx_revolve.genotypes.{module}"), function)
-        genotype: Genotype = make(space, params, f"{source}: bodies")
-        return genotype
+        return make(space, params, f"{source}: bodies")
     if parse_user_function(name) is None:
         known = ", ".join(GENOTYPES)
         raise InputError(

@@ -78,8 +78,7 @@ def robot_qpos(model: mujoco.MjModel, data: mujoco.MjData, number: int) -> np.nd
     root = model.joint(f"{number}/root")
     begin, owner = int(root.qposadr[0]), model.body_rootid[model.jnt_bodyid]
     count = 6 + int((owner == owner[root.id]).sum())
-    view: np.ndarray = data.qpos[begin : begin + count]
-    return view
+    return data.qpos[begin : begin + count]
 
 
 def _dressed(robot: Robot) -> mujoco.MjSpec:

@@ -135,8 +135,7 @@ def make_shader(
         picture = jnp.sqrt(jnp.clip(light, 0.0, 1.0)) + trace * (screen - np.array(BACKGROUND))
         return jnp.round(255 * jnp.clip(picture, 0.0, 1.0)).astype(jnp.uint8)
 
-    shader: Shader = jax.jit(shade)
-    return shader
+    return jax.jit(shade)
 
 
 def open_water(up: jax.Array) -> jax.Array:

@@ -110,5 +110,4 @@ def read_command(data: object) -> Command:
     given = {key: value for key, value in data.items() if key != "do"}
     if given and not fields(_COMMANDS[name]):
         raise InputError(f"{name}: expected nothing beside `do`; found {show(given)}")
-    command: Command = read(_COMMANDS[name], given, name)
-    return command
+    return read(_COMMANDS[name], given, name)

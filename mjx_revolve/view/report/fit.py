@@ -66,8 +66,7 @@ def _predictions(fit: Fit) -> str:
     speeds = [p for p in fit.predictions if _is_speed(p)]
     if speeds:
         pictures.append(("mean speeds", svg_source(plot_speeds(speeds))))
-    html: str = sections.fit_predictions(header, rows, pictures)
-    return html
+    return sections.fit_predictions(header, rows, pictures)
 
 
 @in_style
@@ -130,13 +129,11 @@ def _values(fit: Fit) -> str:
         for v, p in zip(fit.values, fit.problem.parameters, strict=True)
     ]
     header = ("number", "found\nfactor, or as said", f"interval\n{LEVEL:.0%}", "before\n95 %")
-    html: str = sections.fit_table(header, rows)
-    return html
+    return sections.fit_table(header, rows)
 
 
 def _unknown(fit: Fit) -> str:
-    html: str = sections.fit_unknown([u.words for u in fit.unknown], fit.advice)
-    return html
+    return sections.fit_unknown([u.words for u in fit.unknown], fit.advice)
 
 
 def _recordings(fit: Fit) -> str:
@@ -156,5 +153,4 @@ def _recordings(fit: Fit) -> str:
         (kind, f"{sigma:.3g}", f"{fit.estimate.inflation.get(kind, 1.0):.2g}")
         for kind, sigma in fit.estimate.noise.items()
     ]
-    html: str = sections.fit_recordings(rows, own, noise)
-    return html
+    return sections.fit_recordings(rows, own, noise)
