@@ -227,6 +227,11 @@ class Checkpoint:
     meta: dict[str, Any]
     damaged: tuple[str, ...] = ()
 
+    @property
+    def positions(self) -> dict[str, int]:
+        """Lengths of the files that only grow when it was saved, by name [bytes]."""
+        return {"metrics.csv": self.meta["metrics_position"], **self.meta.get("positions", {})}
+
 
 def generation_of(path: Path) -> int:
     """After which generation a checkpoint was saved; -1 for another file."""

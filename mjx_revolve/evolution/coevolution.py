@@ -7,8 +7,6 @@ individual's number.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -45,6 +43,7 @@ from mjx_revolve.evolution.novelty import axis_scale, novelty
 from mjx_revolve.evolution.reproduction import make_child, make_founder
 from mjx_revolve.evolution.selection import SCHEMES, Candidates, check_selection
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.files import csv_table
 
 _COUNTERS = ("generation", "next_number", "trials", "seconds")
 
@@ -285,12 +284,7 @@ class BodyEvolution(IndividualEvolution):
         """The archive as CSV: a line for each cell that is taken."""
         if search.archive is None:
             return {}
-        rows, text = archives.rows(search.archive), io.StringIO()
-        if rows:
-            writer = csv.DictWriter(text, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
-        return {"archive.csv": text.getvalue().encode()}
+        return {"archive.csv": csv_table(archives.rows(search.archive))}
 
     # --- to and from a checkpoint
 

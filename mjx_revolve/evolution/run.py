@@ -40,7 +40,7 @@ from mjx_revolve.evolution.run_folder import (
 from mjx_revolve.evolution.tensorboard import TensorBoardLog, check_tensorboard
 from mjx_revolve.inputs.commands import check_place
 from mjx_revolve.inputs.errors import InputError, reading, show
-from mjx_revolve.inputs.files import with_path
+from mjx_revolve.inputs.files import naming
 from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.inputs.user_code import announce
 from mjx_revolve.numerics import runtime
@@ -514,14 +514,9 @@ def timestamp() -> str:
 def _claim_folder(config: Config) -> Path:
     """A new folder below `runs/`, unique even if other runs begin at the same time."""
     stem = f"{config.name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-    count = 1
+    names = itertools.chain([stem], (f"{stem}-{n}" for n in itertools.count(2)))
     while True:
-        folder = _RUNS / (stem if count == 1 else f"{stem}-{count}")
-        try:
+        folder = _RUNS / next(names)
+        with naming(folder), contextlib.suppress(FileExistsError):
             folder.mkdir(parents=True)
-        except FileExistsError:
-            count += 1
-        except OSError as error:
-            raise with_path(error, folder) from None
-        else:
             return folder

@@ -47,7 +47,7 @@ from mjx_revolve.episodes.settings import copy_files, locate_files
 from mjx_revolve.evolution.archive import Archive, filled, from_arrays
 from mjx_revolve.inputs.commands import check_no_sweep
 from mjx_revolve.inputs.errors import InputError, reading, show
-from mjx_revolve.inputs.files import check_path, resolve_inside, with_path, write_atomic
+from mjx_revolve.inputs.files import check_path, naming, resolve_inside, write_atomic
 
 try:
     import fcntl
@@ -100,7 +100,7 @@ class RunFolder(RunReader):
         """Appends a row to `metrics.csv`; the file's first line names the columns."""
         text = io.StringIO()
         writer = csv.writer(text)
-        try:
+        with naming(self.metrics_path):
             columns: list[str] = []
             if self.metrics_path.exists():
                 with open(self.metrics_path, encoding="utf-8", newline="") as file:
@@ -112,19 +112,14 @@ class RunFolder(RunReader):
             writer.writerow(_number(row.get(name, math.nan)) for name in columns)
             with open(self.metrics_path, "ab") as file:
                 file.write(text.getvalue().encode())
-        except OSError as error:
-            raise with_path(error, self.metrics_path) from None
 
     # --- logs ---
 
     def append_lines(self, name: str, lines: Iterable[str]) -> None:
         """Adds lines to one of `LOGS`."""
         path = self.path / name
-        try:
-            with open(path, "ab") as file:
-                file.write("".join(f"{line}\n" for line in lines).encode())
-        except OSError as error:
-            raise with_path(error, path) from None
+        with naming(path), open(path, "ab") as file:
+            file.write("".join(f"{line}\n" for line in lines).encode())
 
     def _positions(self) -> dict[str, int]:
         """The lengths of the files that only grow, flushed: a checkpoint will count on them."""
@@ -173,8 +168,7 @@ class RunFolder(RunReader):
         for checkpoint in self.readable_checkpoints(damaged):
             try:
                 _check_meta(checkpoint.meta)
-                at = {"metrics.csv": checkpoint.meta["metrics_position"]}
-                for name, position in (at | checkpoint.meta.get("positions", {})).items():
+                for name, position in checkpoint.positions.items():
                     log = self.path / name
                     have = log.stat().st_size if log.exists() else 0
                     if have < position:
@@ -199,8 +193,7 @@ class RunFolder(RunReader):
             for name in ("metrics.csv", *LOGS):
                 (self.path / name).unlink(missing_ok=True)
         else:
-            positions = {"metrics.csv": checkpoint.meta["metrics_position"]}
-            for name, position in (positions | checkpoint.meta.get("positions", {})).items():
+            for name, position in checkpoint.positions.items():
                 if (self.path / name).exists():
                     os.truncate(self.path / name, position)
             for path in self.checkpoints():
@@ -367,13 +360,11 @@ def begin_run_folder(folder: str | Path, copies: Mapping[str, bytes], **info: ob
     """
     check_new_folder(folder)
     folder = Path(folder).absolute()
-    try:
+    with naming(folder):
         folder.mkdir(parents=True, exist_ok=True)
         run = _lock_run(folder)
         (folder / "inputs").mkdir(exist_ok=True)
         (folder / "checkpoints").mkdir(exist_ok=True)
-    except OSError as error:
-        raise with_path(error, folder) from None
     for name, content in copies.items():
         write_atomic(folder / name, content)
     hashes = {name: hashlib.sha256(content).hexdigest() for name, content in copies.items()}
@@ -428,10 +419,8 @@ def _lock_run(folder: Path) -> RunFolder:
     if fcntl is None:
         return RunFolder(folder)
     made = not (folder / ".lock").exists()
-    try:
+    with naming(folder / ".lock"):
         lock = open(folder / ".lock", "a", encoding="utf-8")  # noqa: SIM115  (kept open)
-    except OSError as error:
-        raise with_path(error, folder / ".lock") from None
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

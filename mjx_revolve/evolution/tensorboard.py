@@ -9,11 +9,11 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from mjx_revolve.inputs.files import with_path
+from mjx_revolve.inputs.files import naming
 from mjx_revolve.inputs.packages import check_package
 
 # The group of a column in TensorBoard; measures of the task have their own.
@@ -51,7 +51,7 @@ class TensorBoardLog:
         from tensorboardX.proto.event_pb2 import SessionLog
 
         self._folder = folder
-        with self._naming_folder():
+        with naming(self._folder):
             folder.mkdir(parents=True, exist_ok=True)
             resumed = any(folder.glob("events.out.tfevents.*"))
             # The library's name has the second only: two starts within one must not meet.
@@ -60,17 +60,10 @@ class TensorBoardLog:
         for row in () if resumed else history:
             self.add(row)
 
-    @contextlib.contextmanager
-    def _naming_folder(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise with_path(error, self._folder) from None
-
     def _write(self, **event: object) -> None:
         from tensorboardX.proto.event_pb2 import Event
 
-        with self._naming_folder():
+        with naming(self._folder):
             self._writer.write_event(Event(wall_time=time.time(), **event))
             self._writer.flush()
 

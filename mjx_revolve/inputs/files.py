@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import errno
+import io
 import os
 import stat
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from mjx_revolve.inputs.errors import InputError, reading, show
@@ -122,17 +124,16 @@ def write_atomic(path: Path, content: bytes | Callable[[Path], None]) -> None:
     # The temporary name keeps the suffix: some writers go by it.
     temporary = path.with_name(f".{os.getpid()}-{path.name}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if callable(content):
-            content(temporary)
-        else:
-            temporary.write_bytes(content)
-        with open(temporary, "rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        sync_folder(path.parent)
-    except OSError as error:
-        raise with_path(error, path) from None
+        with naming(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if callable(content):
+                content(temporary)
+            else:
+                temporary.write_bytes(content)
+            with open(temporary, "rb+") as file:
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+            sync_folder(path.parent)
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -147,6 +148,20 @@ def sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-def with_path(error: OSError, path: Path) -> OSError:
-    """The same error with the path that the user gave."""
-    return OSError(error.errno, error.strerror or str(error), str(path))
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Gives the system's errors within the context the path that the user gave."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from None
+
+
+def csv_table(rows: Sequence[Mapping[str, object]]) -> bytes:
+    """Rows as CSV (RFC 4180) under the names of all their cells; what a row lacks stays empty."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(dict.fromkeys(name for row in rows for name in row)))
+    if rows:
+        writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue().encode()

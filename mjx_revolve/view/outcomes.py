@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +14,7 @@ from mjx_revolve.episodes.fitness import read_modules
 from mjx_revolve.episodes.run_reader import RunReader
 from mjx_revolve.episodes.tasks import TASKS, score_unit
 from mjx_revolve.evolution.sweeps import Plan
-from mjx_revolve.inputs.files import short_path, write_atomic
+from mjx_revolve.inputs.files import csv_table, short_path, write_atomic
 from mjx_revolve.view.population import read_population
 
 Figures = dict[str, float]
@@ -111,9 +109,5 @@ def by_case(outcomes: Sequence[Outcome], cases: Iterable[str]) -> dict[str, list
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
-    """Rows as CSV (RFC 4180), whole or not at all; what a row lacks stays empty."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(dict.fromkeys(name for row in rows for name in row)))
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomic(path, text.getvalue().encode())
+    """Rows as CSV, whole or not at all; see `csv_table`."""
+    write_atomic(path, csv_table(rows))
