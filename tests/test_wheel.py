@@ -74,7 +74,10 @@ def test_a_wheel_holds_all_that_a_checkout_has(wheel):
         held = set(file.namelist())
     expected = set()
     for folder, patterns in (
-        ("mjx_revolve", ("*.py", "py.typed", "*.html", "*.js", "*.css", "worlds/*.yaml")),
+        (
+            "mjx_revolve",
+            ("*.py", "py.typed", "*.html", "*.js", "*.css", "*.jinja", "worlds/*.yaml"),
+        ),
         ("configs", ("*",)),
         ("morphologies", ("*",)),
     ):

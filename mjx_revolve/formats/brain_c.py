@@ -7,7 +7,7 @@ import re
 import numpy as np
 
 from mjx_revolve.formats.brain import Brain, describe_brain
-from mjx_revolve.formats.brain_code import Code, array_text, is_bracketed
+from mjx_revolve.formats.brain_code import TEMPLATES, Code, array_text, is_bracketed
 from mjx_revolve.formats.brain_program import Value, View, kind_of, number_text
 
 _TYPES = {"real": "brain_real", "int": "int32_t", "bool": "bool"}
@@ -90,7 +90,7 @@ def make_brain_c(brain: Brain, stem: str) -> tuple[str, str]:
     ]
     # C99 has no empty structures.
     nothing = ["    char nothing;"]
-    header = _HEADER.format(
+    header = TEMPLATES.get_template("brain.h.jinja").render(
         comment="\n   ".join([title, *words, *interface]).replace("`", ""),
         rate=repr(brain.rate), count=len(brain.commands),
         sensors="\n".join(sensors or nothing), state="\n".join(fields or nothing),
@@ -129,7 +129,7 @@ def make_brain_c(brain: Brain, stem: str) -> tuple[str, str]:
         if f"{name}(" in every
     ]
     names = ", ".join(f'"{name}"' for name in brain.commands)
-    return header, _SOURCE.format(
+    return header, TEMPLATES.get_template("brain.c.jinja").render(
         stem=stem,
         tables="\n".join([*tables, *functions, ""]),
         names=names,
@@ -187,77 +187,3 @@ def share_buffers(lines: list[str], values: tuple[Value, ...]) -> tuple[list[str
 
 def _number(x: np.generic) -> str:
     return number_text(x, "NAN", "INFINITY")
-
-
-_HEADER = """/* {comment}
-*/
-#ifndef BRAIN_H
-#define BRAIN_H
-
-#include <stdbool.h>
-#include <stdint.h>
-
-#ifdef BRAIN_DOUBLE
-typedef double brain_real;
-#else
-typedef float brain_real;
-#endif
-
-#define BRAIN_RATE {rate} /* calls of brain_step a second [Hz] */
-#define BRAIN_COMMANDS {count}
-
-#ifdef __cplusplus
-extern "C" {{
-#endif
-
-typedef struct {{
-{sensors}
-}} brain_sensors;
-
-typedef struct {{
-{state}
-}} brain_state;
-
-extern const char *const brain_names[BRAIN_COMMANDS];
-extern const brain_real brain_low[BRAIN_COMMANDS];
-extern const brain_real brain_high[BRAIN_COMMANDS];
-
-void brain_init(brain_state *state);
-
-/* One at a time: its working arrays are static. */
-void brain_step(brain_state *state, brain_real time, const brain_sensors *sensors,
-                brain_real commands[BRAIN_COMMANDS]);
-
-#ifdef __cplusplus
-}}
-#endif
-#endif
-"""
-
-_SOURCE = """/* See {stem}.h. Compile with -lm; -DBRAIN_DOUBLE for double precision. */
-#include "{stem}.h"
-
-#include <math.h>
-
-#ifdef BRAIN_DOUBLE
-#define BRAIN_F(name) name
-#else
-#define BRAIN_F(name) name##f
-#endif
-
-const char *const brain_names[BRAIN_COMMANDS] = {{{names}}};
-const brain_real brain_low[BRAIN_COMMANDS] = {{{low}}};
-const brain_real brain_high[BRAIN_COMMANDS] = {{{high}}};
-
-{tables}
-void brain_init(brain_state *state)
-{{
-{start}
-}}
-
-void brain_step(brain_state *state, brain_real time, const brain_sensors *sensors,
-                brain_real commands[BRAIN_COMMANDS])
-{{
-{body}
-}}
-"""

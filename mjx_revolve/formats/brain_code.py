@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from itertools import pairwise
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -22,7 +23,10 @@ from mjx_revolve.formats.brain_program import (
     find_view,
     split_runs,
 )
+from mjx_revolve.inputs.templates import make_templates
 
+TEMPLATES = make_templates(Path(__file__).with_name("templates"), html=False)
+"""Of the files, around what `Code` writes."""
 # Longer expressions get a name; a choice.
 _MAX_EXPRESSION = 100
 

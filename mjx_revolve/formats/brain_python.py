@@ -7,36 +7,12 @@ import textwrap
 import numpy as np
 
 from mjx_revolve.formats.brain import Brain, describe_brain
-from mjx_revolve.formats.brain_code import Code, array_text, is_bracketed
+from mjx_revolve.formats.brain_code import TEMPLATES, Code, array_text, is_bracketed
 from mjx_revolve.formats.brain_program import Value, View, kind_of, number_text
 
 # Takes of more runs than this are done by a table of places.
 _MOST_RUNS = 8
 _DTYPES = {"real": "REAL", "int": "np.int32", "bool": "bool"}
-
-_HEAD = '''"""{title}
-
-{words}
-
-    brain = Brain()
-    commands = brain.step(time, sensors)
-
-`time` is in seconds since the start, `sensors` maps each name of SENSORS to its numbers. The brain
-keeps a state from call to call; `init` begins anew.
-"""
-
-import numpy as np
-
-REAL = np.float32  # or np.float64
-RATE = {rate!r}  # calls of `step` a second [Hz]; commands hold until the next call
-
-# {interface}
-COMMANDS = {commands}
-LOW = {low}
-HIGH = {high}
-SENSORS = {sensors}
-
-'''
 
 
 class _PythonCode(Code):
@@ -96,19 +72,10 @@ def make_brain_python(brain: Brain) -> str:
     program, code = brain.program, _PythonCode(brain.program)
     code.write()
     title, words, interface = describe_brain(brain)
-    text = _HEAD.format(
-        title=title,
-        words="\n".join(words),
-        rate=brain.rate,
-        interface="\n# ".join(interface),
-        commands=wrapped(repr(list(brain.commands))),
-        low=wrapped(f"np.array({list(brain.low)}, REAL)"),
-        high=wrapped(f"np.array({list(brain.high)}, REAL)"),
-        sensors=wrapped(repr({signal.name: signal.size for signal in brain.signals})),
-    )
+    tables = ""
     for name, data in code.constants.items():
         dtype = _DTYPES[kind_of(data.dtype)]
-        text += wrapped(f"{name} = np.array({array_text(data, _number)}, {dtype})") + "\n"
+        tables += wrapped(f"{name} = np.array({array_text(data, _number)}, {dtype})") + "\n"
     start, states = [], [program.values[program.state[k]] for k in code.live_states]
     for k, value in zip(code.live_states, states, strict=True):
         data = program.initial[k]
@@ -127,34 +94,19 @@ def make_brain_python(brain: Brain) -> str:
         after = [code.name_of(program.after[k]) for k in code.live_states]
         body.append(f"self.state = ({', '.join(after)},)")
     body.append(f"return {code.name_of(program.commands)}.copy()")
-    lines = "\n".join(wrapped(f"        {line}") for line in body)
-    return text + _TAIL.format(start=", ".join([*start, ""]).strip(), body=lines)
-
-
-_TAIL = '''
-
-def _read(sensors, name):
-    """The numbers of a sensor."""
-    found = np.array(sensors[name], REAL).reshape(-1)
-    if len(found) != SENSORS[name]:
-        raise ValueError(f"sensors[{{name!r}}]: expected {{SENSORS[name]}}; found {{len(found)}}")
-    return found
-
-
-class Brain:
-    """Sensors to commands."""
-
-    def __init__(self):
-        self.init()
-
-    def init(self):
-        """Begins anew."""
-        self.state = ({start})
-
-    def step(self, time, sensors):
-        """Commands, in the order of COMMANDS, within LOW and HIGH."""
-{body}
-'''
+    return TEMPLATES.get_template("brain.py.jinja").render(
+        title=title,
+        words="\n".join(words),
+        rate=brain.rate,
+        interface="\n# ".join(interface),
+        commands=wrapped(repr(list(brain.commands))),
+        low=wrapped(f"np.array({list(brain.low)}, REAL)"),
+        high=wrapped(f"np.array({list(brain.high)}, REAL)"),
+        sensors=wrapped(repr({signal.name: signal.size for signal in brain.signals})),
+        tables=tables,
+        start=", ".join([*start, ""]).strip(),
+        body="\n".join(wrapped(f"        {line}") for line in body),
+    )
 
 
 def _number(x: np.generic) -> str:

@@ -5,7 +5,6 @@ It lists the properties that the simulation has of the robot, and those that it 
 
 from __future__ import annotations
 
-import base64
 import io
 import math
 from collections.abc import Sequence
@@ -13,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 from PIL import Image, ImageDraw
 
@@ -24,6 +22,7 @@ from mjx_revolve.body.placement import Module
 from mjx_revolve.engine.plant import read_actuators
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.formats.links import make_links, make_meshes
+from mjx_revolve.inputs.templates import data_address, make_templates
 from mjx_revolve.view.palette import ACCENT
 from mjx_revolve.view.pieces import Scene, make_pieces, place_pieces
 from mjx_revolve.view.raster import draw_scene, make_view
@@ -78,10 +77,7 @@ def make_build_page(robot: Robot, title: str = "") -> str:
     """
     body, balance = robot.morphology, weigh(robot)
     here = Path(__file__).parent
-    templates = jinja2.Environment(
-        loader=jinja2.FileSystemLoader([here, here / "report"]), autoescape=True,
-        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
+    templates = make_templates(here, here / "report")
     return templates.get_template("build_page.html").render(
         name=body.name,
         title=title,
@@ -320,7 +316,7 @@ def _draw(scene: Scene, whole: Scene, view: np.ndarray) -> str:
         draw.text(tuple(corner + (length + 8) * way), name, fill=(60, 70, 80), anchor="mm")
     buffer = io.BytesIO()
     picture.save(buffer, "PNG", optimize=True)
-    return _source(buffer.getvalue(), "image/png")
+    return data_address(buffer.getvalue(), "image/png")
 
 
 def _stl_files(body: Morphology) -> list[dict[str, object]]:
@@ -331,12 +327,8 @@ def _stl_files(body: Morphology) -> list[dict[str, object]]:
         scaled.apply_scale(1e3)
         stl: Any = scaled.export(file_type="stl")
         found.append(
-            {"name": f"{name}.stl", "source": _source(stl, "model/stl"),
+            {"name": f"{name}.stl", "source": data_address(stl, "model/stl"),
              "size": " × ".join(f"{x:.4g}" for x in scaled.extents),
              "volume": float(scaled.volume) / 1e3}
         )  # fmt: skip
     return found
-
-
-def _source(data: bytes, kind: str) -> str:
-    return f"data:{kind};base64,{base64.b64encode(data).decode()}"

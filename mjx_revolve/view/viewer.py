@@ -19,6 +19,7 @@ import numpy as np
 
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import PAGES, check_name, write_atomic
+from mjx_revolve.inputs.templates import make_templates
 from mjx_revolve.view.palette import page_palette
 
 if TYPE_CHECKING:
@@ -142,11 +143,7 @@ def fill_page(template: str, **values: object) -> str:
     Returns:
         The text of an HTML file.
     """
-    import jinja2
-
-    pages = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(_FILES), autoescape=True, undefined=jinja2.StrictUndefined
-    )
+    pages = make_templates(_FILES)
     pages.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     file = lambda name: (_FILES / name).read_text(encoding="utf-8")  # noqa: E731
     page = pages.get_template(f"{template}.html")

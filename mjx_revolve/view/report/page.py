@@ -5,7 +5,6 @@ Words and markup are in `sections.html`, a function for each section, and `page.
 
 from __future__ import annotations
 
-import base64
 import datetime
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jinja2
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
@@ -25,6 +23,7 @@ from mjx_revolve.episodes.fitness import fit_body, make_fitness, read_modules
 from mjx_revolve.episodes.scoring import REPORT_EPISODES
 from mjx_revolve.evolution.fingerprints import model_hash
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.templates import data_address, make_templates
 from mjx_revolve.inputs.trust import UntrustedError
 from mjx_revolve.view import convergence, motion_plots
 from mjx_revolve.view.colony_history import ColonyHistory
@@ -43,23 +42,16 @@ from mjx_revolve.view.swim_picture import draw_motion
 GENERATOR = "mjx_revolve.report"  # identifies pages of this package
 
 
-def _make_templates() -> jinja2.Environment:
-    """The templates beside this file; all that is put into them is escaped."""
-    templates = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True,
-        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    templates.filters["digits"] = tables.format_number
-    templates.filters["letter"] = letter
-    templates.filters["color"] = lambda index: COLORS[index % len(COLORS)]
-    templates.filters["png"] = lambda data: _source(data, "png")
-    templates.filters["svg"] = lambda data: _source(data, "svg+xml")
-    templates.filters["inline"] = lambda data: Markup(inline_svg(data))
-    templates.globals |= {"episodes": REPORT_EPISODES, "coverage": COVERAGE}
-    return templates
-
-
-_TEMPLATES = _make_templates()
+_TEMPLATES = make_templates(Path(__file__).parent)
+_TEMPLATES.filters |= {
+    "digits": tables.format_number,
+    "letter": letter,
+    "color": lambda index: COLORS[index % len(COLORS)],
+    "png": lambda data: data_address(data, "image/png"),
+    "svg": lambda data: data_address(data, "image/svg+xml"),
+    "inline": lambda data: Markup(inline_svg(data)),
+}
+_TEMPLATES.globals |= {"episodes": REPORT_EPISODES, "coverage": COVERAGE}
 # Its macros, each a function from values to HTML.
 sections: Any = _TEMPLATES.get_template("sections.html").module
 
@@ -187,7 +179,9 @@ def _colony(record: RunRecord, history: ColonyHistory) -> str:
         history, colony, room if isinstance(room, int) else None, record.individual
     )
     # Thousands of lines and dots take less room as points of a picture.
-    sources = {name: _source(figure_png(figure), "png") for name, figure in figures.items()}
+    sources = {
+        name: data_address(figure_png(figure), "image/png") for name, figure in figures.items()
+    }
     command = shlex.join(["python", "-m", "mjx_revolve.viewer", record.label, "--colony"])
     return sections.colony(tables.colony_table(history), sources, command)
 
@@ -257,7 +251,7 @@ def _champion(record: RunRecord, replay: ChampionReplay | None) -> str:
         if replay.traces else None,
     }  # fmt: skip
     pictures = {name: figure and svg_source(figure) for name, figure in drawn.items()}
-    pictures["swim"] = _source(figure_jpeg(draw_motion(motion)), "jpeg")
+    pictures["swim"] = data_address(figure_jpeg(draw_motion(motion)), "image/jpeg")
     origin = record.champion.get("origin")
     return sections.champion(
         robot.morphology.title, float(motion.time[-1]), motion.counted_from,
@@ -266,14 +260,9 @@ def _champion(record: RunRecord, replay: ChampionReplay | None) -> str:
     )  # fmt: skip
 
 
-def _source(data: bytes, kind: str) -> str:
-    """A picture's bytes as an address that holds them: kind "svg+xml", "png" or "jpeg"."""
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
-
-
 def svg_source(figure: Figure) -> str:
     """A figure as an address that holds it."""
-    return _source(figure_svg(figure), "svg+xml")
+    return data_address(figure_svg(figure), "image/svg+xml")
 
 
 # --- several runs ---------------------------------------------------------------------------------
