@@ -5,36 +5,18 @@
 
 from __future__ import annotations
 
-import argparse
-import math
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.body.table import module_table, summary, thruster_table
-from mjx_revolve.inputs.commands import Parser, program, read_path, run_command
+from mjx_revolve.inputs.commands import Parser, positive, program, read_path, run_command
 from mjx_revolve.inputs.errors import plain
 
 # Fresh water at 15 °C, the thesis's value [kg/m³].
 _DENSITY = 999.1026
 _GRAVITY = 9.81  # m/s²
-
-
-def _positive(unit: str) -> Callable[[str], float]:
-    """Makes a reader of numbers above 0, for `add_argument(type=_positive("m"))`."""
-
-    def read(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not 0 < value < math.inf:
-            raise argparse.ArgumentTypeError(f"expected a number > 0 [{unit}]; found {text!r}")
-        return value
-
-    return read
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -61,12 +43,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--picture", type=read_path, metavar="OUT.png", help="draw it as well")
     parser.add_argument(
         "--density",
-        type=_positive("kg/m3"),
+        type=positive("kg/m3"),
         default=_DENSITY,
         help="of the water, kg/m³ (default %(default)s)",
     )
     parser.add_argument(
-        "--gravity", type=_positive("m/s2"), default=_GRAVITY, help="m/s² (default %(default)s)"
+        "--gravity", type=positive("m/s2"), default=_GRAVITY, help="m/s² (default %(default)s)"
     )
     parser.add_argument(
         "--modules", type=read_path, metavar="MY.yaml", help="module types of your own"

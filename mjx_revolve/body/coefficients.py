@@ -19,12 +19,20 @@ from typing import Any
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.params import apply_overrides, check_overrides, multiply_factors
 from mjx_revolve.body.placement import Module
-from mjx_revolve.inputs.errors import InputError, reading, show
+from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.files import read_file
+from mjx_revolve.inputs.schema import checked, read
 from mjx_revolve.inputs.yaml_reader import load_yaml, parse_yaml
 
 ALL = "all"
 Entries = Mapping[str, Mapping[str, Any]]
+
+
+@checked
+class _File:
+    """A file of coefficients."""
+
+    modules: dict[Any, dict[Any, Any]]
 
 
 def load_coefficients(path: str | Path) -> dict[str, dict[str, Any]]:
@@ -38,12 +46,7 @@ def load_coefficients(path: str | Path) -> dict[str, dict[str, Any]]:
     """
     data = load_yaml(path)
     with reading(path):
-        entries = data.get("modules") if isinstance(data, dict) else None
-        if not isinstance(data, dict) or set(data) != {"modules"} or not isinstance(entries, dict):
-            raise InputError(f"expected a mapping `modules`; found {show(data)}")
-        for name, params in entries.items():
-            if not isinstance(params, dict):
-                raise InputError(f"modules.{name}: expected a mapping; found {show(params)}")
+        entries = read(_File, data).modules
         return {str(k): check_overrides(v, f"modules.{k}") for k, v in entries.items()}
 
 

@@ -6,11 +6,20 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-import numpy as np
 from annotated_types import MaxLen, MinLen
 
 from mjx_revolve.body.boxes import union_measure
-from mjx_revolve.body.module_types import Box, Hinge, ModuleType, Mount, Name, Part, Slot, Vector
+from mjx_revolve.body.module_types import (
+    Box,
+    Hinge,
+    ModuleType,
+    Mount,
+    Name,
+    Part,
+    Slot,
+    Vector,
+    box_corners,
+)
 from mjx_revolve.body.sensors import SensorRow
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.schema import Boolean, TupleOf, checked, read, words
@@ -96,9 +105,7 @@ def _read_part(item: dict[str, Any], index: int, place: str) -> Part:
             TupleOf[Box], MinLen(1), MaxLen(_MAX_BOXES), words(f"a list of 1 to {_MAX_BOXES} boxes")
         ]
         boxes = read(several, item["boxes"], f"{place}.boxes")
-    center = np.array([box.position for box in boxes])
-    half = np.array([box.size for box in boxes]) / 2
-    solid = union_measure(center - half, center + half)
+    solid = union_measure(*box_corners(boxes))
     return read(Part, {"name": f"part{index}", "volume": solid, "boxes": boxes} | rest, place)
 
 

@@ -6,6 +6,7 @@ part that is fixed to the parent, and further parts that move. `catalogue.py` ho
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import field
 from functools import cached_property
 from typing import Annotated
@@ -67,6 +68,13 @@ class Box:
     def volume(self) -> float:
         """Volume of the full box [m³]."""
         return self.size[0] * self.size[1] * self.size[2]
+
+
+def box_corners(boxes: Sequence[Box]) -> tuple[np.ndarray, np.ndarray]:
+    """`[n, 3]` lowest and `[n, 3]` highest corners of boxes [m]."""
+    center = np.array([box.position for box in boxes])
+    half = np.array([box.size for box in boxes]) / 2
+    return center - half, center + half
 
 
 @checked
@@ -180,16 +188,13 @@ class Part:
     @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """`[3]` lowest and `[3]` highest corner of the boxes, part frame [m]."""
-        center = np.array([box.position for box in self.boxes])
-        half = np.array([box.size for box in self.boxes]) / 2
-        return (center - half).min(0), (center + half).max(0)
+        low, high = box_corners(self.boxes)
+        return low.min(0), high.max(0)
 
     @cached_property
     def face_areas(self) -> np.ndarray:
         """`[3]` silhouette of all boxes together, seen along x, y, z of the part frame [m²]."""
-        center = np.array([box.position for box in self.boxes])
-        half = np.array([box.size for box in self.boxes]) / 2
-        low, high = center - half, center + half
+        low, high = box_corners(self.boxes)
         sides = [[1, 2], [0, 2], [0, 1]]
         return np.array([union_measure(low[:, s], high[:, s]) for s in sides])
 

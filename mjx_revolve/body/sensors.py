@@ -6,6 +6,7 @@ MuJoCo's where it has such a sensor (gyro, accelerometer).
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from operator import attrgetter
 from typing import Annotated, Any, NamedTuple
@@ -271,13 +272,11 @@ class Sensor:
 
     def to_mapping(self) -> dict[str, object]:
         """A mapping as in a morphology file, without default values."""
-        usual: dict[str, object] = {"name": "", "at": None, "each": None}
-        usual |= {"unit": None, "range": None, "noise": 0.0, "rate": None, "delay": 0.0}
-        found: dict[str, object] = {"type": self.type}
-        for key, value in usual.items():
-            own = getattr(self, key)
-            if own != value:
-                found[key] = list(own) if isinstance(own, tuple) else own
+        found: dict[str, object] = {}
+        for field in dataclasses.fields(self):
+            own = getattr(self, field.name)
+            if own != field.default:
+                found[field.name] = list(own) if isinstance(own, tuple) else own
         return found
 
 

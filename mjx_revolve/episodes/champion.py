@@ -32,7 +32,7 @@ from mjx_revolve.episodes.individual_log import LoggedIndividual, find_individua
 from mjx_revolve.episodes.run_reader import ChampionRecord, RunReader, find_run, read_champion
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.episodes.simulate import Trajectory, simulate
-from mjx_revolve.episodes.starts import gusty_water
+from mjx_revolve.episodes.starts import draw_gusts, gusty_water
 from mjx_revolve.episodes.tasks import score_unit
 from mjx_revolve.inputs.commands import opening_episode
 from mjx_revolve.inputs.errors import InputError
@@ -40,7 +40,7 @@ from mjx_revolve.inputs.files import check_path
 from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.inputs.short_repr import short_repr
 from mjx_revolve.inputs.yaml_reader import load_yaml
-from mjx_revolve.water.flow import Water, gust_path
+from mjx_revolve.water.flow import Water
 from mjx_revolve.water.world import load_world
 
 # Duration of the episode of a morphology without a task [s].
@@ -131,9 +131,8 @@ def load_episode(
     key = None if seed is None else jax.random.key(seed)
     seconds, gusty = duration or _SECONDS, None
     if water.gust is not None:
-        gust_key = jax.random.fold_in(jax.random.key(seed or 0), 1)
         steps = max(1, round(seconds / water.timestep))
-        gusts = gust_path(water.gust, gust_key, steps, water.timestep, 1)
+        gusts = draw_gusts(water, jax.random.key(seed or 0), steps, 1)
         gusty = gusty_water(water, gusts[..., 0])
     trajectory = simulate(robot, None, seconds, key=key, water=gusty, once=True)
     return Episode(morphology.name, robot, trajectory, water=gusty)

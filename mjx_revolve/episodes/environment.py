@@ -34,7 +34,7 @@ from mjx_revolve.episodes.rollout import (
     held,
     start_at_rest,
 )
-from mjx_revolve.episodes.scoring import extend_track
+from mjx_revolve.episodes.scoring import extend_track, pick_near
 from mjx_revolve.episodes.starts import Starts, draw_starts, gust_rows
 from mjx_revolve.inputs.errors import InputError
 
@@ -313,9 +313,4 @@ def _period(rate: float | None, record_every: int, timestep: float) -> int:
     rates = {n: 1 / (n * timestep) for n in range(record_every, 0, -1) if record_every % n == 0}
     if rate is None:
         return min(rates, key=lambda n: abs(np.log(rates[n] / _USUAL_RATE)))
-    if isinstance(rate, int | float | np.number) and not isinstance(rate, bool):
-        for n, known in rates.items():
-            if abs(known - rate) < 1e-3 * known:
-                return n
-    shown = ", ".join(f"{known:.4g}" for known in rates.values())
-    raise InputError(f"control_rate: expected one of {shown} Hz; found {rate!r}")
+    return pick_near(rates, rate, "control_rate", "Hz")

@@ -10,15 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import yaml
 from jaxtyping import PyTree
+from pydantic import Strict
 
 from mjx_revolve.control.controller import Controller, StepOutput
 from mjx_revolve.control.readings import SensorReadings
@@ -31,7 +32,8 @@ from mjx_revolve.episodes.evaluation import Chunk, task_recorder
 from mjx_revolve.episodes.fitness import Fitness, fit_body
 from mjx_revolve.episodes.scoring import PASSPORT_STREAM, replay_key
 from mjx_revolve.episodes.simulate import Trajectory
-from mjx_revolve.inputs.errors import InputError, show
+from mjx_revolve.inputs.errors import reading
+from mjx_revolve.inputs.schema import Text, checked, read
 from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.numerics.xla import over_chunks
 from mjx_revolve.water.bed import bed_height
@@ -81,7 +83,11 @@ TORQUE = 0.7
 reaches it; a servo that uses more is at its limit for most of the time."""
 
 
-class Check(NamedTuple):
+_Value = Annotated[float, Strict()]  # any: a share of nothing is NaN
+
+
+@checked
+class Check:
     """A line of a passport.
 
     Attributes:
@@ -92,11 +98,11 @@ class Check(NamedTuple):
         most: the largest; None for any.
     """
 
-    words: str
-    value: float
-    unit: str = ""
-    least: float | None = None
-    most: float | None = None
+    words: Text
+    value: _Value
+    unit: Text = ""
+    least: _Value | None = None
+    most: _Value | None = None
 
     @property
     def judged(self) -> bool:
@@ -115,6 +121,9 @@ class Check(NamedTuple):
         found = [] if self.least is None else [f"at least {self.least:g}"]
         found += [] if self.most is None else [f"at most {self.most:g}"]
         return " and ".join(found)
+
+
+_FIELDS = [field.name for field in fields(Check)]
 
 
 @dataclass(frozen=True)
@@ -145,7 +154,7 @@ class Passport:
     def to_text(self) -> str:
         """The text of `champion/passport.yaml`."""
         checks = {
-            name: {k: v for k, v in check._asdict().items() if v not in (None, "")}
+            name: {k: v for k, v in vars(check).items() if v not in (None, "")}
             | ({"passed": check.passed} if check.judged else {})
             for name, check in self.checks.items()
         }
@@ -161,24 +170,10 @@ def load_passport(path: Path) -> Passport:
     """
     data = load_yaml(path)
     checks = data.get("checks") if isinstance(data, dict) else None
-    if not isinstance(checks, dict):
-        raise InputError(f"{path}: checks: expected a mapping; found {show(checks)}")
-    return Passport({str(name): _read_check(f"{path}: checks.{name}", row)
-                     for name, row in checks.items()})  # fmt: skip
-
-
-def _read_check(place: str, row: object) -> Check:
-    if not isinstance(row, dict) or not isinstance(row.get("words"), str):
-        raise InputError(f"{place}: expected words and a value; found {show(row)}")
-
-    def number(name: str) -> float:
-        x = row.get(name)
-        if isinstance(x, bool) or not isinstance(x, int | float):
-            raise InputError(f"{place}.{name}: expected a number; found {show(x)}")
-        return float(x)
-
-    least, most = (number(name) if name in row else None for name in ("least", "most"))
-    return Check(row["words"], number("value"), str(row.get("unit", "")), least, most)
+    with reading(path):
+        rows = read(dict[Text, dict[str, Any]], checks, "checks")
+        known = {name: {k: row[k] for k in _FIELDS if k in row} for name, row in rows.items()}
+        return Passport(read(dict[str, Check], known, "checks"))
 
 
 # ------------------------------------------------------------------ making one

@@ -21,9 +21,9 @@ import numpy as np
 
 from mjx_revolve.episodes.config import Config, load_config
 from mjx_revolve.inputs.commands import check_no_sweep
-from mjx_revolve.inputs.errors import InputError, show
+from mjx_revolve.inputs.errors import InputError, reading, show
 from mjx_revolve.inputs.files import SWEEP, check_path, read_file
-from mjx_revolve.inputs.schema import LARGEST
+from mjx_revolve.inputs.schema import Number, TupleOf, read
 from mjx_revolve.inputs.yaml_reader import load_yaml
 
 _CHECKPOINT = re.compile(r"generation_(\d+)\.npz")
@@ -233,6 +233,11 @@ class Checkpoint:
         return {"metrics.csv": self.meta["metrics_position"], **self.meta.get("positions", {})}
 
 
+def arrays_of(prefix: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays with names that begin so, by the rest of their names."""
+    return {n.removeprefix(prefix): arrays[n] for n in arrays if n.startswith(prefix)}
+
+
 def generation_of(path: Path) -> int:
     """After which generation a checkpoint was saved; -1 for another file."""
     match = _CHECKPOINT.fullmatch(path.name)
@@ -254,11 +259,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
             raise DamageError(f"{broken} is damaged")
         with np.load(path, allow_pickle=False) as file:
             meta = json.loads(file["meta"].tobytes())
-            arrays = {
-                name.removeprefix("array:"): file[name]
-                for name in file.files
-                if name.startswith("array:")
-            }
+            arrays = arrays_of("array:", file)
     # Errors that the readers raise for a damaged zip, header or JSON.
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, RuntimeError,
             NotImplementedError, MemoryError, SyntaxError) as error:  # fmt: skip
@@ -346,13 +347,7 @@ def read_champion(path: Path) -> ChampionRecord:
     """
     data = load_yaml(path)
     genes = data.get("genes") if isinstance(data, dict) else None
-    if not isinstance(genes, list):
-        raise InputError(f"{path}: genes: expected a list of numbers; found {show(genes)}")
-    for index, gene in enumerate(genes):
-        number = isinstance(gene, float | int) and not isinstance(gene, bool)
-        if not number or not abs(gene) <= LARGEST:
-            raise InputError(
-                f"{path}: genes: expected a list of finite numbers; found {show(gene)} at {index}"
-            )
+    with reading(path):
+        genes = read(TupleOf[Number], genes, "genes")
     facts = {name: value for name, value in data.items() if name != "genes"}
     return ChampionRecord(path, np.asarray(genes, np.float32), facts)

@@ -17,6 +17,7 @@ from jaxtyping import Array, Int
 from mjx_revolve.engine.plant import BodyGeometry
 from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.tasks import Task
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.world import World
 
@@ -123,6 +124,20 @@ def may_touch_bed(task: Task, settings: TaskConfig, world: World, reach: float) 
     line = np.linspace(-reach, reach, 101)
     highest = float(np.max(bed_height(world.bed, *np.meshgrid(line, line))))
     return task.on_bed or world.surface_height - settings.depth - reach < highest
+
+
+def pick_near(choices: Mapping[int, float], wanted: object, place: str, unit: str) -> int:
+    """The key of the choice that a number means.
+
+    Raises:
+        InputError: it is none of them, to a thousandth.
+    """
+    if isinstance(wanted, int | float | np.number) and not isinstance(wanted, bool):
+        for key, known in choices.items():
+            if abs(known - wanted) < 1e-3 * known:
+                return key
+    shown = ", ".join(f"{known:.4g}" for known in choices.values())
+    raise InputError(f"{place}: expected one of {shown} {unit}; found {wanted!r}")
 
 
 def average_trials(scores: Scores, trials: int) -> tuple[jax.Array, dict[str, jax.Array]]:

@@ -32,7 +32,7 @@ from mjx_revolve.episodes.rollout import (
     controlled,
     start_at_rest,
 )
-from mjx_revolve.episodes.scoring import extend_track, list_episodes
+from mjx_revolve.episodes.scoring import extend_track, list_episodes, pick_near
 from mjx_revolve.episodes.starts import Starts, check_key, gust_rows
 from mjx_revolve.episodes.tape import advance_taped, float_leaves, wide_leaves
 from mjx_revolve.inputs.errors import InputError
@@ -264,9 +264,4 @@ def make_windows(fitness: Fitness, horizon: float | None = None) -> TruncatedBPT
     if horizon is None:
         return TruncatedBPTT(fitness, records)
     known = {n: n * row for n in range(1, records + 1) if records % n == 0}
-    if isinstance(horizon, int | float) and not isinstance(horizon, bool):
-        for n, seconds in known.items():
-            if abs(seconds - horizon) < 1e-3 * seconds:
-                return TruncatedBPTT(fitness, n)
-    shown = ", ".join(f"{seconds:.4g}" for seconds in known.values())
-    raise InputError(f"horizon: expected one of {shown} s; found {horizon!r}")
+    return TruncatedBPTT(fitness, pick_near(known, horizon, "horizon", "s"))

@@ -16,6 +16,7 @@ import numpy as np
 
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.individual_log import GENERATIONS, INDIVIDUALS
+from mjx_revolve.episodes.run_reader import arrays_of
 from mjx_revolve.evolution import archive as archives
 from mjx_revolve.evolution.archive import Archive, make_archive
 from mjx_revolve.evolution.executor import Executor
@@ -309,11 +310,7 @@ class BodyEvolution(IndividualEvolution):
         seed = self.config.evolution.seed
         with reading_state("a search over bodies", _COUNTERS, seed, arrays) as counters:
             known = from_records(unpack_json(arrays["individuals"]), self.fitness)
-            own = {
-                name.removeprefix("archive."): value
-                for name, value in arrays.items()
-                if name.startswith("archive.")
-            }
+            own = arrays_of("archive.", arrays)
             archive = archives.from_arrays(own) if own else None
             ids = [] if archive is None else sorted(archive.ids[archives.filled(archive)].tolist())
             return BodySearch(

@@ -13,6 +13,7 @@ import numpy as np
 from mjx_revolve.engine.interaction import ContactParameters
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.individual_log import EVENTS, GENERATIONS, INDIVIDUALS
+from mjx_revolve.episodes.run_reader import arrays_of
 from mjx_revolve.episodes.tank import TankTrajectory, make_tank
 from mjx_revolve.evolution.colony import (
     CAUSES,
@@ -286,11 +287,7 @@ class ColonyEvolution(IndividualEvolution):
                     replace(known[int(number)], score=float(score))
                     for number, score in plain["elites"]
                 ),
-                tank={
-                    name.removeprefix("tank."): value
-                    for name, value in arrays.items()
-                    if name.startswith("tank.")
-                },
+                tank=arrays_of("tank.", arrays),
                 **counters,
             )
 

@@ -42,7 +42,13 @@ from mjx_revolve.episodes.individual_log import (
     LoggedIndividual,
     find_individuals,
 )
-from mjx_revolve.episodes.run_reader import Checkpoint, DamageError, RunReader, generation_of
+from mjx_revolve.episodes.run_reader import (
+    Checkpoint,
+    DamageError,
+    RunReader,
+    arrays_of,
+    generation_of,
+)
 from mjx_revolve.episodes.settings import copy_files, locate_files
 from mjx_revolve.evolution.archive import Archive, filled, from_arrays
 from mjx_revolve.inputs.commands import check_no_sweep
@@ -280,8 +286,7 @@ def load_archive(folder: str | Path) -> tuple[Archive, list[LoggedIndividual]]:
         InputError: it is no run folder, or has no archive yet.
     """
     run = RunFolder(check_path(folder))
-    arrays = run.load_checkpoint().arrays
-    own = {k.removeprefix("archive."): v for k, v in arrays.items() if k.startswith("archive.")}
+    own = arrays_of("archive.", run.load_checkpoint().arrays)
     if not own:
         raise InputError(f"{folder}: expected a run with bodies.archive; found none in it")
     with reading(folder):

@@ -32,7 +32,8 @@ from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.numerics import runtime
 from mjx_revolve.water.world import load_world, read_world_files
 
-_FILES = "robot.yaml", "modules.yaml", "recordings.npz"
+# Of a state, what a checkpoint has as plain values.
+_PLAIN = ("noise", "common", "cost", "moved", "inflated")
 
 
 @dataclass(frozen=True)
@@ -210,19 +211,10 @@ class FitRun:
         resets = self.problem.drive.resets
         resets[:] = arrays.get("resets", resets)  # folders of older versions have no cut windows
         point = Point(arrays["free"], arrays["local"], arrays["starts"])
-        names = ("common", "generation", "cost", "moved", "inflated")
-        common, iteration, cost, moved, inflated = (meta[name] for name in names)
         self.state = FitState(
-            point,
-            meta["noise"],
-            arrays["damping"],
-            common,
-            iteration,
-            cost,
-            moved,
-            inflated,
-            arrays.get("steps"),
-        )
+            point, damping=arrays["damping"], iteration=meta["generation"],
+            steps=arrays.get("steps"), **{name: meta[name] for name in _PLAIN},
+        )  # fmt: skip
 
     def save(self) -> None:
         """A checkpoint of the state."""
@@ -234,8 +226,7 @@ class FitRun:
                   "resets": self.problem.drive.resets}  # fmt: skip
         if state.steps is not None:
             arrays["steps"] = state.steps
-        meta = {"noise": state.noise, "common": state.common, "cost": state.cost,
-                "moved": min(state.moved, 1e30), "inflated": state.inflated}  # fmt: skip
+        meta = {name: getattr(state, name) for name in _PLAIN} | {"moved": min(state.moved, 1e30)}
         self.folder.save_checkpoint(state.iteration, arrays, meta, 2)
 
     def run(self, interrupts: Interrupts) -> Fit | None:

@@ -76,19 +76,24 @@ def read_path(text: str) -> str:
     return text
 
 
-def read_seconds(text: str) -> float:
-    """Reads a duration [s], for `add_argument(type=read_seconds)`."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f"expected seconds > 0; found {text!r}")
-    if value > _LONGEST_EPISODE:
-        raise argparse.ArgumentTypeError(
-            f"expected at most {_LONGEST_EPISODE:.0f} s; found {text!r}"
-        )
-    return value
+def positive(unit: str, most: float = math.inf) -> Callable[[str], float]:
+    """A reader of numbers above 0, for `add_argument(type=positive("m"))`."""
+
+    def read(text: str) -> float:
+        """Reads a number within the bounds."""
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not 0 < value <= most or value == math.inf:
+            bounds = "> 0" if most == math.inf else f"> 0 and <= {most:g}"
+            raise argparse.ArgumentTypeError(f"expected a number {bounds} [{unit}]; found {text!r}")
+        return value
+
+    return read
+
+
+read_seconds = positive("s", _LONGEST_EPISODE)
 
 
 def whole(low: int, high: int | None = None) -> Callable[[str], int]:

@@ -369,7 +369,7 @@ def test_a_champion_that_fails_its_passport_is_marked(copy, quick, capsys):
     assert "champion of a run: fails its passport: kept_120_s" in capsys.readouterr().out
     path.write_text("checks: {a: 3}")
     record = read_run(copy)
-    assert "expected words and a value; found 3" in record.problems[0].text
+    assert "checks.a: expected a mapping; found 3" in record.problems[0].text
 
 
 def test_the_command_prints_and_writes_a_passport(copy, monkeypatch, capsys):
