@@ -125,10 +125,8 @@ def _lead(
     if folder is not None and arguments.out is not None:
         raise InputError(f"--resume {folder}: expected no --out beside it; found {arguments.out}")
     trust = arguments.trust
-    if path is not None:
-        find_shipped(path, "configs")  # a name that there is not is known at once
-    print(plain(f"loading {folder or path}"), flush=True)  # it takes seconds
     config = _check(arguments)
+    print(plain(f"loading {folder or path}"), flush=True)  # it takes seconds
     if make_fitness is None and not arguments.cluster and runtime.expects_cpu():
         # They import JAX and the rest while this process does.
         from mjx_revolve.evolution.executor import choose_workers
@@ -172,11 +170,13 @@ def _check(arguments: argparse.Namespace) -> Config | None:
     if folder is None:
         with opening_config(path, arguments.trust):
             return load_config(path, arguments.settings)
+    if path is not None:
+        find_shipped(path, "configs")  # a name that there is not is known at once
     found = Path(folder) / "config.yaml"
     if not found.is_file():  # its folder is checked when it is locked
         return None
     with opening(folder, *([path] if path else []), trust=arguments.trust):
-        return load_config(found)
+        return load_config(found, () if path else arguments.settings)
 
 
 def _evolve(run: Run, interrupts: Interrupts) -> int:

@@ -27,7 +27,7 @@ from mjx_revolve.inputs.commands import (
 )
 from mjx_revolve.inputs.errors import plain
 from mjx_revolve.inputs.files import short_path
-from mjx_revolve.inputs.grids import MOST_SEEDS
+from mjx_revolve.inputs.grids import MOST_SEEDS, read_axes
 from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.numerics import runtime
 
@@ -78,6 +78,7 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     arguments = _parser().parse_args(argv)
     check_run_arguments(arguments)
     path = find_shipped(arguments.config, "configs").absolute()
+    read_axes(arguments.settings)  # what is no setting at all is known at once
     print(plain(f"loading {arguments.config}"), flush=True)  # it takes seconds
     runtime.prepare_process()
     from mjx_revolve.evolution.executor import make_executor
