@@ -185,7 +185,7 @@ def write_docs(folder: Path) -> tuple[list[Path], list[str]]:
     ]
     pdoc.render.env.globals["doors"] = [(door, summary_of(door)) for door in DOORS]
     written = []
-    with warnings.catch_warnings(record=True) as complaints:
+    with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always", UserWarning)
         for name, document in documents.items():
             path = folder / f"{name.replace('.', '/')}.html"
@@ -199,7 +199,7 @@ def write_docs(folder: Path) -> tuple[list[Path], list[str]]:
         (folder / "search.js").write_text(index, encoding="utf-8")
     for picture in (*DOCS.glob("*.png"), *DOCS.glob("*.jpg")):
         shutil.copyfile(picture, folder / picture.name)
-    found = [str(c.message).partition("\n")[0] for c in complaints]
+    found = [str(c.message).partition("\n")[0] for c in warned]
     return written, list(dict.fromkeys(found))
 
 
@@ -209,15 +209,15 @@ def title_of(text: str) -> str:
 
 
 def main() -> int:
-    """Runs the command: 0, or 1 where pdoc had something to complain about."""
+    """Runs the command: 0, or 1 where pdoc warned."""
     parser = argparse.ArgumentParser(description="Writes the documentation as HTML.")
     parser.add_argument("folder", type=Path, help="where to, such as build/docs")
     folder = parser.parse_args().folder
-    written, complaints = write_docs(folder)
-    for complaint in complaints:
-        print(f"error: {complaint}", file=sys.stderr)
+    written, warned = write_docs(folder)
+    for warning in warned:
+        print(f"error: {warning}", file=sys.stderr)
     print(f"{len(written)} pages: open {folder / 'index.html'}")
-    return 1 if complaints else 0
+    return 1 if warned else 0
 
 
 if __name__ == "__main__":

@@ -191,7 +191,7 @@ def _evolve(run: Run, interrupts: Interrupts) -> int:
     print(plain(_describe(run)), flush=True)
     if run.resumed:
         print(f"resuming {run.resumption}", flush=True)
-    interrupts.be_patient("finishing what is under way")
+    interrupts.finish_first("finishing what is under way")
     champion = run.evolve(interrupts, _save_pictures)
     if champion is None:
         saved = f"stopped after {run.unit} {run.generation}; all of it is saved"

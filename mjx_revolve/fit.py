@@ -157,7 +157,7 @@ def _finish(run: FitRun, interrupts: Interrupts) -> int:
         f"{len(problem.recordings)} recordings, {int(problem.drive.resets.sum())} windows of "
         f"{problem.window:.3g} s | {place}"
     ), flush=True)  # fmt: skip
-    interrupts.be_patient("finishing the step that is under way")
+    interrupts.finish_first("finishing the step that is under way")
     fit = run.run(interrupts)
     if fit is None:
         print(
@@ -182,7 +182,7 @@ def describe(fit: Fit) -> list[str]:
         ends = f"[{v.low:.4g}, {v.high:.4g}]" if v.found else "not found by itself"
         lines.append(f"{v.name}: {v.value:.4g} {unit} {ends}")
     lines += [f"{r}: {n} {x:.3g} ± {s:.2g}" for r, n, x, s in fit.local]
-    lines += [f"{u.words}: the recordings do not tell more" for u in fit.unknown]
+    lines += [f"{u.words}: the recordings do not determine more" for u in fit.unknown]
     for p in fit.predictions:
         held = bool(p.held.any())
         what = "held out" if held else "fitted"
@@ -199,7 +199,7 @@ def describe(fit: Fit) -> list[str]:
     if not fit.state.finished:
         lines.append("the search has not arrived: give it more --set iterations")
     if fit.advice:
-        lines.append(f"what would tell most: {fit.advice}")
+        lines.append(f"the most informative motion: {fit.advice}")
     return lines
 
 

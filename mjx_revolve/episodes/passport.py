@@ -234,7 +234,7 @@ def _swim(fitness: Fitness, genes: jax.Array, key: jax.Array) -> Iterator[tuple[
         scores = coarse.result()
         finer = {part: found.result()[usual].mean() for part, found in fine.items()}
     own = scores[usual][:_STARTS]
-    # Scores that are no rates are no shares of each other: they are shown as they are, not judged.
+    # Scores that are no rates are no shares of each other: they are shown and have no limit.
     rates = unit.endswith("/s")
 
     def compare(words: str, found: np.ndarray, of: np.ndarray, least: float | None = None) -> Check:
@@ -389,7 +389,7 @@ def _silenceable(controller: Controller) -> Controller:
 
 
 def _joints(fitness: Fitness, trajectory: Trajectory) -> Iterator[tuple[str, Check]]:
-    """What one episode asks of joints, of the busiest of them, and of the room between modules."""
+    """The loads of one episode on all joints and on the busiest, and the room between modules."""
     robot = fitness.robot
     if not robot.num_hinges:
         return

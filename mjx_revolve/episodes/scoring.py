@@ -32,7 +32,7 @@ _FASTEST = 3.0
 # Recorded rates, which are 0 where nothing moves.
 RATES = ("energy", "water_velocity")
 
-# Fresh episodes on which a champion is judged, and the stream of random numbers that draws them,
+# Fresh episodes on which a champion is evaluated, and the stream of random numbers that draws them,
 # which no generation uses.
 REPORT_EPISODES = 16
 REPORT_STREAM = 2**32 - 2
@@ -158,7 +158,7 @@ def average_trials(scores: Scores, trials: int) -> tuple[jax.Array, dict[str, ja
 
 
 def replay_key(seed: int) -> jax.Array:
-    """The first of the fresh starts on which a run's champion is judged.
+    """The first of the fresh starts on which a run's champion is evaluated.
 
     Args:
         seed: of the run.

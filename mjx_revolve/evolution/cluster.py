@@ -104,7 +104,7 @@ def score(limits: Limits, pickled: bytes, block: Block, key: KeyData) -> Scored:
     from mjx_revolve.evolution.blocks import evaluate_block, key_from_data
 
     fitness, times, _ = _open(pickled)
-    with _watched(limits.patience(times)):
+    with _watched(limits.timeout(times)):
         began = time.perf_counter()
         result = evaluate_block(fitness, block, key_from_data(key))
         times.append(time.perf_counter() - began)

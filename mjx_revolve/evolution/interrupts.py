@@ -26,7 +26,7 @@ _EARLY = "interrupted before the run began"
 class Interrupts:
     """Takes the signals while it is entered, in the main thread.
 
-    At first a signal ends the process at once, with one line. From `be_patient` on, the first is
+    At first a signal ends the process at once, with one line. From `finish_first` on, the first is
     noted, and the generation in progress can be finished; the second ends the process after saving.
 
     Attributes:
@@ -48,7 +48,7 @@ class Interrupts:
         self._thread: threading.Thread | None = None
         self._former = -1
 
-    def be_patient(self, answer: str) -> None:
+    def finish_first(self, answer: str) -> None:
         """From now on the first signal is only noted, and answered by a line."""
         self._answer = answer
 

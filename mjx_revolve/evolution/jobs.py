@@ -46,7 +46,7 @@ class Limits:
     factor: float = 50.0
     tries: int = 3
 
-    def patience(self, times: Sequence[float]) -> float:
+    def timeout(self, times: Sequence[float]) -> float:
         """For the next block, by the times of those before it [s]."""
         return max(self.block, self.factor * statistics.median(times)) if times else self.block
 

@@ -256,7 +256,7 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
     def attend(self) -> list[tuple[int, Scored | str | None]]:
         """See `WorkerExecutor`; WorkerError where no worker is left, and none can be started."""
         began = time.monotonic()
-        heard = wait([worker.channel for worker in self.workers], _TICK)
+        readable = wait([worker.channel for worker in self.workers], _TICK)
         # Bounded, as this process may have been stopped (Ctrl-Z) in between.
         waited = min(time.monotonic() - began, 2 * _TICK)
         news: list[tuple[int, Scored | str | None]] = []
@@ -264,9 +264,9 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
             idle = worker.ready and worker.block is None
             worker.age += 0.0 if idle else waited
             limits = self.job.limits
-            limit = limits.patience(self._times) if worker.ready else limits.ready
+            limit = limits.timeout(self._times) if worker.ready else limits.ready
             try:
-                if worker.channel in heard:
+                if worker.channel in readable:
                     news += self._take(worker, worker.channel.recv())
                 elif worker.age > limit:
                     news += self._replace(worker, f"no answer for {worker.age:.0f} s")

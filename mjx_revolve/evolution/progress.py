@@ -12,9 +12,9 @@ from typing import TextIO
 
 from tqdm import tqdm
 
-# A log gets about this many lines, however long the run, and never stays silent for longer [s].
+# A log gets about this many lines, however long the run, and one at least in such a time [s].
 _LINES = 60
-_SILENCE = 30.0
+_LONGEST_GAP = 30.0
 # Widths of the live line [columns]: the largest, the default for a terminal without a size, and the
 # smallest of the bar.
 _WIDEST, _USUAL, _BAR = 120, 80, 10
@@ -28,7 +28,7 @@ class _Line(tqdm):
         words: the current activity, shown in place of the figures; "" for none.
     """
 
-    monitor_interval = 0  # no thread that redraws bars which have gone silent
+    monitor_interval = 0  # no thread that redraws bars without progress
     words = "compiling"
     figures: Sequence[str] = ()
 
@@ -162,8 +162,8 @@ class Progress:
         else:
             self._bar.update(generation - self._bar.n)
         last = generation >= self._total
-        silent = time.monotonic() - self._written > _SILENCE
-        if first or last or silent or generation % self._stride == 0:
+        overdue = time.monotonic() - self._written > _LONGEST_GAP
+        if first or last or overdue or generation % self._stride == 0:
             self._write()
 
     def _write(self) -> None:

@@ -360,7 +360,7 @@ class Run:
         if best is None:
             return
         number = {} if best.individual is None else {"individual": best.individual}
-        origin = f"{best.origin}, not yet judged on fresh starts"
+        origin = f"{best.origin}, not yet evaluated on fresh starts"
         self.folder.save_champion(
             best.genes, best.body, score=best.score, final=False, origin=origin, **number
         )

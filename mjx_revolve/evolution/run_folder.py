@@ -420,7 +420,7 @@ def _check_writable(path: Path, folder: Path) -> None:
 
 
 def _lock_run(folder: Path) -> RunFolder:
-    """Keeps a second process from writing the same folder; the lock dies with the process."""
+    """Keeps a second process from writing the same folder; the lock ends with the process."""
     if fcntl is None:
         return RunFolder(folder)
     made = not (folder / ".lock").exists()

@@ -281,7 +281,7 @@ def run_plans(
     Args:
         steps: the runs, from `choose_steps`.
         make_executor: makes the executor of a run.
-        draw: writes the pictures of a run, when its champion is judged.
+        draw: writes the pictures of a run, when its champion is evaluated.
         again: the command that goes on.
 
     Returns:
@@ -298,7 +298,7 @@ def run_plans(
         Interrupts() as interrupts,
         contextlib.closing(SharedExecutor(make_executor)) as executors,
     ):
-        interrupts.be_patient("stopping after the generation under way")
+        interrupts.finish_first("stopping after the generation under way")
         for k, (plan, step) in enumerate(steps.items()):
             if interrupts.signal:
                 break

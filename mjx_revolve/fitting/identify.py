@@ -1,4 +1,4 @@
-"""What recordings can tell apart, in words; and which motions would tell the rest apart."""
+"""What recordings determine, in words; and which motions would determine the rest."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def scaled(parameters: Sequence[Parameter], information: np.ndarray) -> np.ndarr
 
 
 def find_unknown(parameters: Sequence[Parameter], information: np.ndarray) -> list[Unknown]:
-    """The directions that data do not tell, the least known first.
+    """The directions that data do not determine, the least known first.
 
     Args:
         parameters: P free numbers.
@@ -166,7 +166,7 @@ def motion_problem(
 
 
 def information_of(problem: FitProblem) -> np.ndarray:
-    """`[R, P, P]` what each recording of a problem would tell by itself, with usual noise."""
+    """`[R, P, P]` what each recording of a problem would contribute by itself, with usual noise."""
     model = linearize(problem, problem.origin())
     if not np.isfinite(model.track).all():
         raise InputError("plan: expected motions that can be simulated; found some that diverge")
@@ -185,7 +185,7 @@ def information_of(problem: FitProblem) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MotionPlan:
-    """A programme of motions, the most telling first.
+    """A programme of motions, the most informative first.
 
     Attributes:
         motions: in order.
@@ -207,7 +207,7 @@ def plan_motions(
     known: np.ndarray | None = None,
     count: int | None = None,
 ) -> MotionPlan:
-    """A short programme of motions that tells free numbers apart: D-optimal, one by one.
+    """A short programme of motions that determines the free numbers: D-optimal, one by one.
 
     Args:
         robot: with the numbers that it has now.

@@ -66,7 +66,7 @@ class RobotRecording:
         name: of the file.
         signals: by name.
         marks: points on the robot, by name.
-        notes: what a person should know of it, a line each.
+        notes: remarks for the user, a line each.
     """
 
     name: str
@@ -146,10 +146,10 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
             signals = _read_csv(path, rest, robot)
         signals, marks = _name_marks(signals, marks, robot)
         signals, notes = _check_signals(signals, robot)
-    silent = [m.name for m in robot.morphology.modules if m.kind.hinge or m.kind.is_thruster]
-    silent = [n for n in silent if not {f"command.{n}", f"angle.{n}"} & set(signals)]
-    if silent:
-        notes.append(f"no commands of {', '.join(silent)}: taken to be 0")
+    uncommanded = [m.name for m in robot.morphology.modules if m.kind.hinge or m.kind.is_thruster]
+    uncommanded = [n for n in uncommanded if not {f"command.{n}", f"angle.{n}"} & set(signals)]
+    if uncommanded:
+        notes.append(f"no commands of {', '.join(uncommanded)}: taken to be 0")
     return RobotRecording(path.stem, signals, marks, tuple(notes))
 
 

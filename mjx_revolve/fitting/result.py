@@ -86,7 +86,7 @@ class Fit:
         state: where the search ended.
         estimate: of the numbers.
         values: the numbers.
-        unknown: what the recordings do not tell.
+        unknown: what the recordings do not determine.
         local: (recording, name, value, standard deviation) of what each recording has of its own.
         predictions: of all recordings, those held out first.
         advice: the most informative further motion, and the largest of the remaining uncertainties
@@ -198,7 +198,7 @@ def fit_robot(
         free: names of what is free, as `drag`, `thrust@port`, `current`.
         settings: of the fit.
         seed: of the draws with which the search begins.
-        advise: whether the motion that would tell most is looked for.
+        advise: whether the most informative motion is looked for.
 
     Returns:
         What was found.

@@ -44,7 +44,7 @@ def program(name: str, python: str = "python") -> str:
 
 
 class Parser(argparse.ArgumentParser):
-    """Argument parser with errors of one line, like those about files.
+    """Argument parser with errors of one line, as for files.
 
     Args:
         examples: what to type, from the command's name on; `--help` ends with them.

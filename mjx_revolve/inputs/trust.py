@@ -157,7 +157,7 @@ def _remember(path: Path, kind: Kind, content: bytes) -> None:
         with open(record, "a", encoding="ascii", opener=_private) as file:
             file.write(f"{_digest(kind, content)}\n")
     except OSError as error:  # a read-only home: --trust is needed again
-        _log.warning("not remembered that you use %s: %s", path, error.strerror)
+        _log.warning("not recorded that you use %s: %s", path, error.strerror)
 
 
 def _private(name: str, flags: int) -> int:

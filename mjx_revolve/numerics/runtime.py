@@ -86,7 +86,7 @@ def find_cache() -> Path | None:
 
 
 def expects_cpu() -> bool:
-    """Whether JAX will find nothing but CPUs, judged from the environment before its import."""
+    """Whether JAX will find nothing but CPUs (as the environment says before its import)."""
     if os.environ.get("JAX_PLATFORMS", "cpu") not in ("", "cpu"):
         return False
     return all(importlib.util.find_spec(name) is None for name in ("jax_plugins", "libtpu"))

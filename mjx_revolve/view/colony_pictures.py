@@ -111,7 +111,7 @@ def _draw_turnover(axes: Axes, history: ColonyHistory, edges: np.ndarray, scale:
     births, deaths = history.of_kind("birth"), history.of_kind("death")
     up = [
         ([e.time for e in births if e.parents], _CHILD, "children born"),
-        ([e.time for e in births if not e.parents], _FOUNDER, "strangers born"),
+        ([e.time for e in births if not e.parents], _FOUNDER, "founders born"),
     ]
     down = [
         ([e.time for e in deaths if e.cause == cause], color, words)

@@ -36,7 +36,7 @@ def save_pictures(run: Run, champion: Champion) -> None:
 
     Args:
         run: the run, its generations done.
-        champion: the champion, judged.
+        champion: the champion, evaluated.
 
     Raises:
         OSError: the disk is full.
@@ -55,11 +55,11 @@ def save_pictures(run: Run, champion: Champion) -> None:
     if config.bodies is not None:
         figures["bodies.png"] = plot_best(folder.path, read_modules(config), title)
     if isinstance(fitness, Fitness):
-        assert champion.key is not None  # it is judged
+        assert champion.key is not None  # it is evaluated
         robot, trajectory = fitness.robot, fitness.replay(champion.genes, champion.key)
         height = float(robot.world.surface_height)
         figures["trajectory.png"] = plot_trajectory(trajectory, height, title)
-        # In the first of the poses from which it was judged.
+        # In the first of the poses from which it was evaluated.
         folder.write(
             "champion/robot.xml", make_mjcf(robot, np.asarray(trajectory.qpos[0])).encode()
         )

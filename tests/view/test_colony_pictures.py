@@ -78,7 +78,7 @@ def test_births_and_deaths_add_up(history):
     bars = np.array([patch.get_height() for patch in low.patches])
     assert bars[bars > 0].sum() == 5 and bars[bars < 0].sum() == -2
     labels = low.get_legend_handles_labels()[1]
-    assert labels == ["children born", "strangers born", "died of age", "died of something else"]
+    assert labels == ["children born", "founders born", "died of age", "died of something else"]
     assert top.lines[0].get_ydata().max() == 4
 
 

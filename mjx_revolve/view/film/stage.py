@@ -59,7 +59,7 @@ def build_stage(
     spec = mujoco.MjSpec()
     spec.modelname = "robots to look at"
     spec.compiler.degree = False
-    # As robots' own, or attaching them complains.
+    # As robots' own, or MuJoCo warns when they are attached.
     spec.option.timestep, spec.option.gravity = world.timestep, [0.0, 0.0, -world.gravity]
     spec.nuser_jnt = 1
     for number, robot in robots.items():

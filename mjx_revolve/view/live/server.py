@@ -23,9 +23,9 @@ from mjx_revolve.view.live.simulation import LiveSimulation
 
 HOST = "127.0.0.1"
 _MAX_CONTENT = 4096  # of what is posted [bytes]
-# Connections at once, of which a browser opens six at most; and how long one of them may be silent,
+# Connections at once, of which a browser opens six at most; and how long one of them may be idle,
 # or leave unread what is sent to it [s]. Choices.
-_MAX_CONNECTIONS, _MAX_SILENCE = 32, 20.0
+_MAX_CONNECTIONS, _MAX_IDLE = 32, 20.0
 _ANSWER_TIMEOUT = 1.5  # for an answer; the page shows that a longer one is under way [s]
 _BEAT = 0.5  # from one state event to the next, at least [s]
 _HEADERS = {
@@ -90,7 +90,7 @@ class LiveServer(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     server: LiveServer
     protocol_version = "HTTP/1.1"
-    timeout = _MAX_SILENCE
+    timeout = _MAX_IDLE
     server_version, sys_version = "mjx_revolve", ""
 
     def log_message(self, format: str, *args: object) -> None:

@@ -240,10 +240,10 @@ class LiveSimulation:
                 reported = now
                 self.publish(self.state_event())
 
-    def _answer(self, patience: float) -> None:
+    def _answer(self, timeout: float) -> None:
         """Does the next command, or waits for one so long [s]."""
         try:
-            command, future = self._commands.get(timeout=max(patience, 1e-3))
+            command, future = self._commands.get(timeout=max(timeout, 1e-3))
         except queue.Empty:
             return
         try:

@@ -46,7 +46,7 @@ def replay_champion(record: RunRecord, fitness: Fitness) -> ChampionReplay:
         fitness: of its configuration, with any seed.
 
     Returns:
-        The first of the fresh starts on which the champion was judged.
+        The first of the fresh starts on which the champion was evaluated.
 
     Raises:
         InputError: there is no champion, or it is another controller's.

@@ -231,7 +231,7 @@ def _check_end(record: RunRecord) -> None:
         done = f"{max(record.generations, newest)}"
         done += f" of {planned}" if isinstance(planned, int) else ""
         record.note("unfinished", f"stopped or still running after {done} {record.round}s: its "
-                    "champion is not judged on fresh starts")  # fmt: skip
+                    "champion is not evaluated on fresh starts")  # fmt: skip
 
 
 def _version(package: str) -> str:

@@ -27,7 +27,7 @@ def make_fit_page(fit: Fit) -> str:
     content = [
         ("predictions", "Predicted beside recorded", _predictions(fit)),
         ("coefficients", "What was found", _values(fit)),
-        ("unknown", "What the recordings do not tell", _unknown(fit)),
+        ("unknown", "What the recordings do not determine", _unknown(fit)),
         ("recordings", "Recordings", _recordings(fit)),
         ("use", "Use it", sections.fit_use(problem.robot.morphology.name)),
     ]

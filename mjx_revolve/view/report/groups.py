@@ -60,7 +60,7 @@ class RunGroup:
         return min((record.generations for record in self.shown), default=0)
 
     def scores(self) -> list[float]:
-        """Scores of the champions that were judged on fresh starts."""
+        """Scores of the champions that were evaluated on fresh starts."""
         found = [number(r.champion.get("score")) for r in self.records if r.is_finished]
         return [score for score in found if score is not None]
 
@@ -73,7 +73,7 @@ class RunGroup:
         return [float(values[-1]) for values in early if len(values)]
 
     def best(self) -> RunRecord:
-        """The run with the best champion: judged ones first, else by the best so far."""
+        """The run with the best champion: evaluated ones first, else by the best so far."""
 
         def rank(record: RunRecord) -> tuple[bool, bool, float]:
             score = number(record.champion.get("score"))

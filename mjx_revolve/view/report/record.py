@@ -166,7 +166,7 @@ class RunRecord:
 
     @property
     def is_finished(self) -> bool:
-        """Whether its champion was judged on fresh starts."""
+        """Whether its champion was evaluated on fresh starts."""
         return "finished" in self.info and number(self.champion.get("score")) is not None
 
     @property

@@ -109,10 +109,10 @@ def colony_table(history: ColonyHistory) -> list[tuple[str, str]]:
     died = [f"{causes[name]} {words}" for name, (_, words) in cause_styles(causes).items()]
     alive = [span.founder for span in history.spans.values() if not span.cause]
     ages = [span.age for span in history.spans.values() if span.cause]
-    strangers = sum(not event.parents for event in births)
+    founders = sum(not event.parents for event in births)
     rows = [
         ("time that it has lived", f"{history.end:,.0f} s"),
-        ("born", f"{len(births)}, {strangers} of them without parents"),
+        ("born", f"{len(births)}, {founders} of them without parents"),
         ("matings", str(len(history.of_kind("mating")))),
         ("dead", ", ".join([str(len(deaths)), *died])),
         ("alive in the end", f"{len(alive)}, of {len(set(alive))} families"),
