@@ -238,7 +238,7 @@ def swap_subtrees(
     """
     first, second = sorted(_find(body, which, core=False) for which in (module, other))
     tree: Sequence[Module] = body.modules
-    if second < _end(tree, first):
+    if second < subtree_end(tree, first):
         raise InputError(
             f"{body.path or body.name}: expected two subtrees apart from each other; found "
             f"{tree[second].name!r} in that of {tree[first].name!r}"
@@ -274,7 +274,7 @@ def exchange_subtrees(
     i, j = _find(a, module_a, core=False), _find(b, module_b, core=False)
 
     def receive(body: Morphology, index: int, graft: list[Module]) -> Morphology:
-        kept = [*body.modules[:index], *body.modules[_end(body.modules, index) :]]
+        kept = [*body.modules[:index], *body.modules[subtree_end(body.modules, index) :]]
         tree = _splice(body.modules, index, _name_apart(graft, kept))
         return _finish(body, tree, allow_overlap, _place(body, index))
 
@@ -319,7 +319,7 @@ def _find_slot(body: Morphology, parent: str | int, slot: int) -> tuple[int, int
     return index, at
 
 
-def _end(modules: Sequence[Module], index: int) -> int:
+def subtree_end(modules: Sequence[Module], index: int) -> int:
     """Index behind the last module of a subtree, which is contiguous: modules are depth first."""
     stop = index + 1
     while stop < len(modules) and modules[stop].parent >= index:
@@ -329,7 +329,7 @@ def _end(modules: Sequence[Module], index: int) -> int:
 
 def _cut(modules: Sequence[Module], index: int) -> list[Module]:
     """A subtree, with indices of parents relative to its own first module."""
-    root, *rest = modules[index : _end(modules, index)]
+    root, *rest = modules[index : subtree_end(modules, index)]
     return [replace(root, parent=-1), *(replace(m, parent=m.parent - index) for m in rest)]
 
 
@@ -351,7 +351,7 @@ def _splice(
     Returns:
         The modules.
     """
-    stop = _end(modules, index) if target is None else index
+    stop = subtree_end(modules, index) if target is None else index
     parent, slot = target or (modules[index].parent, modules[index].slot)
     found = list(modules[:index])
     for k, module in enumerate(graft):
@@ -376,7 +376,7 @@ def _insert(
     """The body with a new subtree at a free slot, before those of higher slots."""
     tree = body.modules
     after = [i for i, m in enumerate(tree) if m.parent == parent and m.slot > slot]
-    index = after[0] if after else _end(tree, parent)
+    index = after[0] if after else subtree_end(tree, parent)
     tree = tuple(_splice(tree, index, _name_apart(graft, tree), (parent, slot)))
     return _finish(body, tree, allow_overlap, f"{_place(body, parent)}.children.{slot}")
 

@@ -25,6 +25,7 @@ from mjx_revolve.engine.state import RootState
 from mjx_revolve.numerics.inertia import BodyMotion
 from mjx_revolve.numerics.spatial import (
     Mat,
+    Scalar,
     Vec,
     cross,
     dot,
@@ -76,7 +77,7 @@ class EpisodeContext(NamedTuple):
     pursuit: PursuitLimits | None = None
     course: Course | None = None
 
-    def target_at(self, time: Any) -> Vec:
+    def target_at(self, time: Scalar) -> Vec:
         """Position of a target that does not pursue the robot, world frame [m], at a time [s]."""
         if self.drift is None:
             return tuple(self.target)
@@ -213,9 +214,8 @@ def _site_frame(
         motion, past = jax.tree.map(lambda x: x[sites.row], (motion, past))
     like = motion.height
 
-    def wide(x: Any) -> jax.Array:
-        x = np.asarray(x, like.dtype) if isinstance(x, np.ndarray) else x
-        return jnp.broadcast_to(x, like.shape)
+    def wide(x: Scalar) -> jax.Array:
+        return jnp.broadcast_to(_plain(x, like), like.shape)
 
     offset, local = jax.tree.map(wide, (sites.position, sites.rotation))
     body: Mat = (motion.x_axis, motion.y_axis, motion.z_axis)
@@ -354,7 +354,7 @@ def read_sensors(
     return readings._replace(modules=modules)
 
 
-def _plain(x: Any, like: jax.Array) -> Any:
+def _plain(x: Scalar, like: jax.Array) -> Scalar:
     """A NumPy array in the floating-point type of the rollout."""
     return np.asarray(x, like.dtype) if isinstance(x, np.ndarray) else x
 

@@ -16,8 +16,8 @@ import numpy as np
 from mjx_revolve.episodes.fitness import Fitness
 from mjx_revolve.numerics.xla import LANES, on_cpu
 
-Block = tuple[Any, ...]
 KeyData = tuple[np.ndarray, str]  # a random key as `key_as_data` has it
+Block = tuple[Any, ...]
 """The arguments of `fitness.evaluate` before the key; the first has one entry per individual."""
 Scored = tuple[np.ndarray, dict[str, np.ndarray]]
 """`[rows]` scores and measures of a block, float32."""
@@ -59,7 +59,7 @@ def block_size(trials: int) -> int | None:
     return max(1, LANES // trials) if on_cpu() else None
 
 
-def choose_block(fitness: Any) -> int | None:
+def choose_block(fitness: object) -> int | None:
     """Individuals in a block of this fitness, which may have its own `block_size`; None: all."""
     if isinstance(fitness, Fitness):
         return block_size(fitness.config.task.trials)

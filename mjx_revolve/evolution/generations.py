@@ -17,9 +17,8 @@ import numpy as np
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.episodes.passport import Passport
 from mjx_revolve.episodes.scoring import REPORT_EPISODES, REPORT_STREAM, replay_key
+from mjx_revolve.evolution.blocks import Scored
 from mjx_revolve.evolution.strategies import FAILED_SCORE
-
-Scored = tuple[np.ndarray, dict[str, np.ndarray]]
 
 # Fresh episodes per candidate to choose the champion. The reported score comes from others
 # (`REPORT_EPISODES`), because the best of several means is biased upwards, too.

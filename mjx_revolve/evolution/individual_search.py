@@ -11,9 +11,10 @@ import numpy as np
 
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.passport import Passport, make_passport
+from mjx_revolve.evolution.blocks import Scored
 from mjx_revolve.evolution.body_fitness import BodyFitness
 from mjx_revolve.evolution.executor import Executor
-from mjx_revolve.evolution.generations import Champion, Scored, choose_candidate
+from mjx_revolve.evolution.generations import Champion, choose_candidate
 from mjx_revolve.evolution.individuals import Individual, best_individuals
 from mjx_revolve.evolution.learning import score_brains
 from mjx_revolve.inputs.errors import InputError

@@ -16,10 +16,10 @@ import numpy as np
 
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.episodes.bodies_config import LearningConfig
+from mjx_revolve.evolution.blocks import Scored
 from mjx_revolve.evolution.body_fitness import BodyFitness
 from mjx_revolve.evolution.brains import GeneLayout
 from mjx_revolve.evolution.executor import Executor
-from mjx_revolve.evolution.generations import Scored
 from mjx_revolve.evolution.individuals import Individual
 from mjx_revolve.evolution.strategies import Strategy, make_strategy
 from mjx_revolve.inputs.errors import InputError

@@ -20,6 +20,7 @@ from mjx_revolve.body.edits import (
     graft_subtree,
     remove_module,
     replace_module,
+    subtree_end,
     swap_subtrees,
     turn_module,
 )
@@ -248,12 +249,7 @@ _MUTATIONS: dict[str, Callable[[Space, np.random.Generator, Morphology], Morphol
 
 def _size(body: Morphology, index: int) -> int:
     """Number of modules of a subtree."""
-    inside = {index}
-    for i in range(index + 1, body.num_modules):
-        if body.modules[i].parent not in inside:
-            break
-        inside.add(i)
-    return len(inside)
+    return subtree_end(body.modules, index) - index
 
 
 # ------------------------------------------------------------------------- symmetry
@@ -289,7 +285,7 @@ def mirror_limb(body: Morphology, index: int) -> Morphology | None:
         The body, with poses not updated; None if a slot has no mirror image.
     """
     modules = list(body.modules)
-    for i in range(index, index + _size(body, index)):
+    for i in range(index, subtree_end(body.modules, index)):
         module, above = modules[i], body.modules[modules[i].parent]
         slot: int | None = module.slot
         if i > index:

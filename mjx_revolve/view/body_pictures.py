@@ -31,7 +31,7 @@ from mjx_revolve.view.plots import (
     whole_numbers,
 )
 from mjx_revolve.view.population import Population, read_population
-from mjx_revolve.view.raster import REST_VIEW, draw_scene
+from mjx_revolve.view.raster import REST_VIEW, draw_scene, on_white
 from mjx_revolve.view.statistics import quantiles
 
 SIZE = (240, 180)
@@ -64,10 +64,9 @@ def draw_bodies(bodies: Sequence[Morphology]) -> list[np.ndarray]:
     for scene, points in zip(scenes, flat, strict=True):
         low, high = points.min(axis=0) - pixel, points.max(axis=0) + pixel
         image = draw_scene(scene, REST_VIEW, low, high, pixel)[0][::-1]
-        on_white = image[..., :3] * image[..., 3:] + 1.0 - image[..., 3:]
         page = np.ones((SIZE[1], SIZE[0], 3))
         top, left = (np.array(page.shape[:2]) - image.shape[:2]) // 2
-        page[top : top + image.shape[0], left : left + image.shape[1]] = on_white
+        page[top : top + image.shape[0], left : left + image.shape[1]] = on_white(image)
         pictures.append(np.round(255 * page).astype(np.uint8))
     return pictures
 

@@ -25,7 +25,7 @@ from mjx_revolve.formats.links import make_links, make_meshes
 from mjx_revolve.inputs.templates import data_address, make_templates
 from mjx_revolve.view.palette import ACCENT
 from mjx_revolve.view.pieces import Scene, make_pieces, place_pieces
-from mjx_revolve.view.raster import draw_scene, make_view
+from mjx_revolve.view.raster import draw_scene, make_view, on_white
 
 # Width and height of a picture [pixels], and what stays free at its edges.
 _SIZE, _MARGIN = np.array([420, 315]), 10
@@ -297,8 +297,7 @@ def _draw(scene: Scene, whole: Scene, view: np.ndarray) -> str:
     pixel = float(((high - low) / (_SIZE - 2 * _MARGIN)).max())
     low = (low + high - pixel * (_SIZE - 2)) / 2
     image = draw_scene(scene, view, low, low + pixel * (_SIZE - 2), pixel)[0][::-1]
-    on_white = image[..., :3] * image[..., 3:] + 1.0 - image[..., 3:]
-    picture = Image.fromarray(np.round(255 * on_white).astype(np.uint8))
+    picture = Image.fromarray(np.round(255 * on_white(image)).astype(np.uint8))
     draw = ImageDraw.Draw(picture)
     # The core's axes in the emptiest corner.
     length, room = 24.0, 34

@@ -22,6 +22,11 @@ _STEP = 1.5e-3
 _TURN = math.cos(math.radians(30.0))
 
 
+def on_white(picture: np.ndarray) -> np.ndarray:
+    """A picture `[height, width, 4]` without its transparency: `[height, width, 3]`."""
+    return picture[..., :3] * picture[..., 3:] + 1.0 - picture[..., 3:]
+
+
 def make_view(azimuth: float, elevation: float) -> np.ndarray:
     """Rotation from the world to a view.
 
