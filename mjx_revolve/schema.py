@@ -134,7 +134,7 @@ def make_schema(kind: str) -> dict[str, Any]:
             forms = [x or usual["items"] for x in getattr(function, "also", ())]
             return {"anyOf": [usual, *forms]} if forms else usual
 
-        def is_instance_schema(self, schema: Any) -> Any:
+        def is_instance_schema(self, schema: object) -> Any:
             """Objects are named by files in YAML."""
             return {"type": "string"}
 
@@ -147,7 +147,7 @@ def make_schema(kind: str) -> dict[str, Any]:
 _BOUNDS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
 
 
-def _with_bounds(value: Any) -> Any:
+def _with_bounds(value: object) -> Any:
     """A schema with its bounds under JSON Schema's names."""
     if isinstance(value, list):
         return [_with_bounds(x) for x in value]

@@ -104,7 +104,7 @@ def _correct(module: Module, entries: Entries) -> Module:
     return replace(module, kind=kind, params=params)
 
 
-def _suited(entry: Mapping[str, Any], kind: ModuleType) -> dict[str, Any]:
+def _suited(entry: Mapping[str, object], kind: ModuleType) -> dict[str, Any]:
     """An entry without the coefficients of thrusters, if the type has no thruster."""
     thruster = kind.is_thruster
     return {k: v for k, v in entry.items() if thruster or k not in ("thruster", "thrust")}

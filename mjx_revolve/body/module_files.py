@@ -48,7 +48,7 @@ class _Written:
     sensors: SensorRow = ()
 
 
-def read_modules(data: Any, usual: Mapping[str, ModuleType]) -> dict[str, ModuleType]:
+def read_modules(data: object, usual: Mapping[str, ModuleType]) -> dict[str, ModuleType]:
     """Reads what a file of module types holds.
 
     Args:
@@ -72,7 +72,7 @@ def read_modules(data: Any, usual: Mapping[str, ModuleType]) -> dict[str, Module
     return kinds
 
 
-def _read_type(name: str, item: Any, usual: Mapping[str, ModuleType], place: str) -> ModuleType:
+def _read_type(name: str, item: object, usual: Mapping[str, ModuleType], place: str) -> ModuleType:
     written = read(_Written, item, place)
     parts = [_read_part(part, i, f"{place}.parts.{i}") for i, part in enumerate(written.parts)]
     holder = parts[0] if written.hinge is None else parts[-1]
@@ -122,14 +122,14 @@ def _read_face(text: str, part: Part, place: str) -> tuple[Vector, Vector]:
     return (position[0], position[1], position[2]), (normal[0], normal[1], normal[2])
 
 
-def _read_mount(item: Any, part: Part, place: str) -> Mount | None:
+def _read_mount(item: object, part: Part, place: str) -> Mount | None:
     if not isinstance(item, str):
         return read(Mount | None, item, place)
     position, (x, y, z) = _read_face(item, part, place)
     return Mount(position, (-x, -y, -z))
 
 
-def _read_slot(item: Any, part: Part, place: str) -> Slot:
+def _read_slot(item: object, part: Part, place: str) -> Slot:
     if not isinstance(item, str):
         return read(Slot, item, place)
     return Slot(*_read_face(item, part, place))

@@ -79,7 +79,7 @@ def load_morphology(
 
 
 def make_morphology(
-    mapping: Mapping[str, Any],
+    mapping: Mapping[str, object],
     modules: Mapping[str, ModuleType] = MODULES,
     allow_overlap: bool = False,
     name: str = "robot",
@@ -141,7 +141,7 @@ def make_morphology(
 
 
 def _make(
-    data: Any, modules: Mapping[str, ModuleType], allow_overlap: bool, name: str, source: str
+    data: object, modules: Mapping[str, ModuleType], allow_overlap: bool, name: str, source: str
 ) -> Morphology:
     """The body of a whole mapping; `name` where it has no `id`."""
     if not isinstance(data, dict):
@@ -179,7 +179,7 @@ def _check_known(item: Mapping[object, object], known: tuple[str, ...], place: s
             raise InputError(f"{place}: expected only {', '.join(known)}; found {show(key)}")
 
 
-def _read_tree(body: Any, modules: Mapping[str, ModuleType], source: str) -> tuple[Module, ...]:
+def _read_tree(body: object, modules: Mapping[str, ModuleType], source: str) -> tuple[Module, ...]:
     """All modules, depth first, with unique names."""
     found: list[Module] = []
     stack: list[tuple[Any, str, int, int]] = [(body, "body", -1, -1)]
@@ -199,7 +199,7 @@ def _read_tree(body: Any, modules: Mapping[str, ModuleType], source: str) -> tup
 
 
 def read_module(
-    item: Any,
+    item: object,
     place: str,
     modules: Mapping[str, ModuleType],
     tree: Sequence[Module],

@@ -216,7 +216,7 @@ def _multiply(kind: ModuleType, factors: Mapping[str, Any]) -> ModuleType:
     return replace(kind, parts=tuple(map(part, kind.parts)), hinge=hinge)
 
 
-def multiply_factors(one: Any, other: Any) -> Any:
+def multiply_factors(one: object, other: object) -> Any:
     """The product of two factors, each a number or three along the part's axes."""
     wide = [x if isinstance(x, tuple | list) else [x] * 3 for x in (one, other)]
     found = [a * b for a, b in zip(*wide, strict=True)]

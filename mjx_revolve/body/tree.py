@@ -248,7 +248,7 @@ class Morphology:
 
 def _unpack(
     name: str,
-    brain: Any,
+    brain: object,
     path: str | None,
     overlaps: tuple[tuple[str, str], ...],
     sensors: tuple[Sensor, ...] | None,

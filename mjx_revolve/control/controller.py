@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.control.sensors import Observer
 from mjx_revolve.engine.plant import Plant, plant_of
 from mjx_revolve.engine.robot import Robot
+from mjx_revolve.numerics.spatial import Scalar
 
 # How long commands take to fade in, so that no joint jumps at the start [s]; a choice.
 _FADE = 0.5
@@ -166,7 +167,7 @@ def make_controller(
     return Controller(len(genes), tuple(map(name, genes)), decode, init, step, tuple(genes))
 
 
-def lag_share(plant: Plant, constant: Any) -> Any:
+def lag_share(plant: Plant, constant: Scalar) -> Scalar:
     """Share of the step response that a first-order lag reaches from one command to the next.
 
     Exact for an input that is held. Without a rate, as in runs of older versions, Euler's method.

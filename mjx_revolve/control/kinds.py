@@ -103,7 +103,7 @@ def _make_brain(plant: Plant, settings: Any, source: str, body: Morphology | Non
     raise InputError(f"{file}: brain: expected {known}; found {found}")
 
 
-def _check_users_controller(name: str, controller: Any, plant: Plant) -> None:
+def _check_users_controller(name: str, controller: object, plant: Plant) -> None:
     """Raises `InputError` unless a user's function made a controller of the plant."""
     place = function_place(name)
     if not isinstance(controller, Controller):
@@ -150,5 +150,5 @@ def _check_users_controller(name: str, controller: Any, plant: Plant) -> None:
         )
 
 
-def _shapes(state: Any) -> str:
+def _shapes(state: object) -> str:
     return str(jax.tree.map(lambda x: f"{x.dtype}{list(x.shape)}", state)).replace("'", "")

@@ -97,7 +97,7 @@ class Synapse:
     weight: Number
 
 
-def _as_list(neurons: Any) -> Any:
+def _as_list(neurons: object) -> Any:
     """Neurons by id as a list of them; an input's type may be left out."""
     if isinstance(neurons, Mapping):
         own = neurons.items()
@@ -154,7 +154,7 @@ class NeuralNetwork(NamedTuple):
     params: tuple[tuple[float, ...], ...]
 
 
-def read_neural_network(brain: Any, source: str) -> NeuralNetwork:
+def read_neural_network(brain: object, source: str) -> NeuralNetwork:
     """Reads what a morphology file has under `brain`.
 
     Raises:

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
+from numpy.typing import DTypeLike
 
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.sensors import Sensor, check_names
@@ -24,7 +25,7 @@ from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.schema import ConstraintError
-from mjx_revolve.numerics.spatial import sincos
+from mjx_revolve.numerics.spatial import Scalar, sincos
 from mjx_revolve.numerics.xla import materialize
 
 DEFAULT_SENSORS = tuple(Sensor(type=name) for name in ("tilt", "gyro", "angle", "speed"))
@@ -37,7 +38,7 @@ _DUE = 0.01
 _MAX_KEPT = 256
 
 
-def count_samples(time: Any, rate: float) -> jax.Array:
+def count_samples(time: Scalar, rate: float) -> jax.Array:
     """The number of samples after the first that are due, a whole number in the type of `time`.
 
     Args:
@@ -92,7 +93,7 @@ class Observer:
         """The `signals` of a `Controller` that uses it."""
         return tuple(dict.fromkeys(name for sensor in self.sensors for name in sensor.signals))
 
-    def init(self, like: jax.Array) -> Any:
+    def init(self, like: jax.Array) -> PyTree:
         """The state: for each sensor with a rate or a delay, its last count and its samples.
 
         Args:
@@ -107,7 +108,7 @@ class Observer:
         return tuple(found)
 
     def observe(
-        self, state: PyTree, time: jax.Array, sense: SensorReadings, joint: Any
+        self, state: PyTree, time: jax.Array, sense: SensorReadings, joint: Scalar
     ) -> tuple[PyTree, Observation]:
         """The state and the observation before a step.
 
@@ -144,7 +145,7 @@ class Observer:
         """Whether there is a rate or a delay."""
         return self._rate(sensor) < 1 / self.timestep or self._kept(sensor) > 1
 
-    def _shapes(self, sensor: Sensor, like: jax.Array) -> Any:
+    def _shapes(self, sensor: Sensor, like: jax.Array) -> PyTree:
         """Zeros of the shapes of a sample: of the robot, of the hinges."""
         where, count = sensor.where, len(sensor.kind.parts)
         robot = [jnp.zeros(like.shape[1:], like.dtype)] * count
@@ -152,7 +153,7 @@ class Observer:
         return (robot if where != "joint" else [], joint)
 
     def _measure(
-        self, place: int, sensor: Sensor, count: jax.Array, sense: SensorReadings, joint: Any
+        self, place: int, sensor: Sensor, count: jax.Array, sense: SensorReadings, joint: Scalar
     ) -> tuple[list[jax.Array], list[jax.Array]]:
         """A sample of a sensor: values of the robot, values of the hinges."""
         kind, (low, high) = sensor.kind, sensor.limits
@@ -181,8 +182,8 @@ class Observer:
         return robot, joints
 
     def _hold(
-        self, sensor: Sensor, state: PyTree, time: jax.Array, count: jax.Array, values: Any
-    ) -> tuple[Any, Any]:
+        self, sensor: Sensor, state: PyTree, time: jax.Array, count: jax.Array, values: PyTree
+    ) -> tuple[PyTree, PyTree]:
         """The samples after this step, and the sample that is the sensor's output."""
         last, kept = state
         first, due = last < 0, count != last
@@ -264,14 +265,16 @@ def resolve_sensors(
         raise InputError(f"{source}: sensors.{error}") from None
 
 
-def _mix(x: Any) -> Any:
+def _mix(x: Scalar) -> Scalar:
     """A hash of 32 bits: Wellons' lowbias32 (nullprogram.com, 2018)."""
     x = (x ^ (x >> np.uint32(16))) * np.uint32(0x7FEB352D)
     x = (x ^ (x >> np.uint32(15))) * np.uint32(0x846CA68B)
     return x ^ (x >> np.uint32(16))
 
 
-def hash_normal(seed: Any, number: int, joint: Any, sample: Any, dtype: Any) -> jax.Array:
+def hash_normal(
+    seed: Scalar, number: int, joint: Scalar, sample: Scalar, dtype: DTypeLike
+) -> jax.Array:
     """A standard normal number that is a function of its arguments alone.
 
     By a hash of a counter and the method of Box and Muller (1958), as `jax.random` inside the

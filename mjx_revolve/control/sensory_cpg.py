@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +24,7 @@ from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.control.sensors import make_observer
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.numerics.spatial import sincos
+from mjx_revolve.numerics.spatial import Scalar, sincos
 from mjx_revolve.numerics.xla import materialize
 
 # Time constant of amplitudes and offsets [s], and coupling strength between neighbours [rad/s]:
@@ -113,7 +112,7 @@ def make_sensory_cpg(
         samples, observation = observer.observe(samples, time, sense, number)
         inputs = [*observation.robot, *observation.joint]
 
-        def respond(weights: Any, inputs: Any) -> Any:
+        def respond(weights: Iterable[Scalar], inputs: Iterable[Scalar]) -> Scalar:
             terms = [w * x for w, x in zip(weights, inputs, strict=True)]
             return gain * sum(terms) if terms else 0.0
 

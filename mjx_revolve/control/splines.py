@@ -63,7 +63,7 @@ def make_splines(
         rows, rate, middle = parameters
         turns = rate * time
         at = points * (turns - jnp.floor(turns))
-        wave: Any = 0.0
+        wave: Scalar = 0.0
         for k, row in enumerate(rows):
             wave = wave + _weight(at - k, points, jnp) * row
         return state, middle + fade_in(time) * wave
@@ -71,9 +71,9 @@ def make_splines(
     return make_controller(made_for, blocks.genes, decode, lambda parameters: (), step)
 
 
-def _weight(way: Any, points: int, xp: Any) -> Any:
+def _weight(way: Scalar, points: int, xp: Any) -> Scalar:
     """The cubic B-spline at a distance (-points to points, in knots) from its centre."""
-    found: Any = 0.0
+    found: Scalar = 0.0
     # A B-spline is four knots wide: on a ring of fewer than that it overlaps itself.
     for turn in (-2, -1, 0, 1, 2) if points < 4 else (-1, 0, 1):
         far = xp.abs(way + turn * points)

@@ -592,7 +592,7 @@ def with_older_values(data: Mapping[str, object], folder: str | Path) -> dict[st
     return found
 
 
-def with_stated(world: Any, fields: Mapping[str, Any], folder: str | Path = "") -> Any:
+def with_stated(world: object, fields: Mapping[str, object], folder: str | Path = "") -> Any:
     """A world's settings with those fields that neither they nor the world's file state."""
     given = {"name": world} if isinstance(world, str) else world
     if not isinstance(given, Mapping) or not isinstance(given.get("name"), str):
@@ -603,7 +603,7 @@ def with_stated(world: Any, fields: Mapping[str, Any], folder: str | Path = "") 
     return {**given, **added} if added else world
 
 
-def state_world(world: Any) -> Any:
+def state_world(world: object) -> Any:
     """A world's settings with today's values of what older versions had otherwise."""
     return with_stated(world, {name: getattr(World, name) for name in OLDER_WORLD})
 

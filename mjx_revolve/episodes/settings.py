@@ -112,12 +112,12 @@ def map_files(
     return found
 
 
-def _kinds(annotation: Any) -> tuple[Any, ...]:
+def _kinds(annotation: object) -> tuple[Any, ...]:
     """A type, or the members of a union."""
     return annotation, *getattr(annotation, "__args__", ())
 
 
-def _is_section(kind: Any) -> bool:
+def _is_section(kind: object) -> bool:
     return isinstance(kind, type) and issubclass(kind, BaseModel)
 
 
@@ -186,7 +186,7 @@ def copy_files(
     return map_files(settings, name, model), copies
 
 
-def locate_files(settings: Any, places: Mapping[str, Path]) -> Any:
+def locate_files(settings: object, places: Mapping[str, Path]) -> Any:
     """Settings in which files have other paths.
 
     Args:

@@ -138,7 +138,7 @@ def fitness_hash(config: Config) -> str:
     return hash_text(_dump(map_files(data, by_content, Config)))
 
 
-def model_hash(fitness: Any) -> str:
+def model_hash(fitness: object) -> str:
     """Fingerprint of the compiled robot and its water; empty for a fitness without a robot."""
     from mjx_revolve.episodes.fitness import Fitness
     from mjx_revolve.evolution.body_fitness import BodyFitness
@@ -156,7 +156,7 @@ def program_versions() -> dict[str, str]:
     return {"mjx_revolve": runtime.source_hash(), **versions}
 
 
-def identify(fitness: Any) -> dict[str, Any]:
+def identify(fitness: object) -> dict[str, Any]:
     """Program, precision, robot and world, which must be equal in all processes of a run."""
     import jax
 

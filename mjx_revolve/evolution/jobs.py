@@ -133,7 +133,7 @@ def open_job(job: Job, scratch: str | Path) -> Any:
     return job.make_fitness(make_config(settings, "/", source=job.source))
 
 
-def compile_job(job: Job, fitness: Any) -> None:
+def compile_job(job: Job, fitness: object) -> None:
     """Compiles a fitness; of a host's workers the first does, and the others read its cache."""
     import jax
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -89,7 +88,7 @@ def _grow(
     parents: Sequence[Individual],
     generation: int,
     origin: str,
-    genome: Any,
+    genome: object,
 ) -> Individual:
     """The body that a genome develops into, and its brain at birth."""
     body = fitness.genotype.develop(genome)

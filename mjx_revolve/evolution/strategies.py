@@ -194,7 +194,7 @@ class Strategy:
         return state | {"algorithm": algorithm}
 
 
-def _on_host(state: Any) -> Any:
+def _on_host(state: object) -> Any:
     return jax.tree.map(np.asarray, state)
 
 

@@ -176,7 +176,7 @@ class Fit:
         return json.dumps(data, indent=2) + "\n"
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(x) for x in value]
     return round(float(value), 9) if isinstance(value, float) else value

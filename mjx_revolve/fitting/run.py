@@ -69,7 +69,7 @@ def read_settings(texts: Sequence[str]) -> tuple[FitSettings, dict[str, Any], bo
 
 
 def load_robot(
-    name: str, world: str | None, modules: str | None, fields: Mapping[str, Any], trim: bool
+    name: str, world: str | None, modules: str | None, fields: Mapping[str, object], trim: bool
 ) -> tuple[Robot, dict[str, Any], dict[str, bytes]]:
     """The robot that a user names, in its water, and what it takes to load it again.
 

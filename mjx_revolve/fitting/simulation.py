@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.variants import Variants
@@ -50,9 +51,9 @@ def _program(variants: Variants, lanes: int, windows: int, steps: int, every: in
     world = variants.tree.world
 
     def run(
-        numbers: Any, roots: Any, resets: Any, angles: Any, speeds: Any, ctrl: Any, later: Any,
-        current: Any,
-    ) -> Any:  # fmt: skip
+        numbers: PyTree, roots: PyTree, resets: PyTree, angles: PyTree, speeds: PyTree,
+        ctrl: PyTree, later: PyTree, current: PyTree,
+    ) -> PyTree:  # fmt: skip
         count = roots.shape[-1]
         wide = lambda x: jnp.broadcast_to(x[..., None, :], (*x.shape[:-1], lanes, x.shape[-1]))  # noqa: E731
         flat = lambda x: x.reshape(*x.shape[:-2], lanes * count)  # noqa: E731
@@ -64,13 +65,13 @@ def _program(variants: Variants, lanes: int, windows: int, steps: int, every: in
         qpos = jnp.concatenate([first[:7], flat(wide(angles))])
         qvel = jnp.concatenate([first[7:], flat(wide(speeds))])
 
-        def record(now: RolloutState, ctrl: Any, water: Water) -> Any:
+        def record(now: RolloutState, ctrl: PyTree, water: Water) -> PyTree:
             root = engine.root(now.state)
             angles = engine.tree.tree_to_joints(now.state.angle, root.position[0])
             pose = (*root.position, *root.quat)
             return jnp.stack([*pose, *root.velocity, *root.angular_velocity, *angles])
 
-        def window(now: RolloutState, given: Any) -> Any:
+        def window(now: RolloutState, given: PyTree) -> PyTree:
             root, reset, ctrl = given
             fresh = flat(wide(reset[None]))[0]
             put = lambda a, b: tuple(jnp.where(fresh, y, x) for x, y in zip(a, b, strict=True))  # noqa: E731

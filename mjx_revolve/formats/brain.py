@@ -13,6 +13,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend import core
+from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from mjx_revolve.body.sensors import Sensor
@@ -163,7 +165,7 @@ def make_brain(
     readings = _blank_readings(plant, controller.signals, seen)
     present = {name: _present(plant, name) for name in readings.modules or ()}
 
-    def step(state: Any, time: jax.Array, sense: SensorReadings) -> Any:
+    def step(state: PyTree, time: jax.Array, sense: SensorReadings) -> PyTree:
         if present:
             own = {k: x._replace(present=present[k]) for k, x in sense.modules.items()}
             sense = sense._replace(modules=own)
@@ -175,7 +177,7 @@ def make_brain(
 
 
 def _lower(
-    robot: Robot, plant: Plant, closed: Any, initial: Any, readings: SensorReadings,
+    robot: Robot, plant: Plant, closed: core.ClosedJaxpr, initial: object, readings: SensorReadings,
     sensors: tuple[Sensor, ...],
 ) -> Brain:  # fmt: skip
     builder = Builder()
@@ -224,7 +226,7 @@ def _command_names(robot: Robot) -> tuple[str, ...]:
     return (*(hinges[k] for k in robot.servos), *jets)
 
 
-def _wide(x: Any) -> Any:
+def _wide(x: object) -> Any:
     """Reals in 64 bits, as they are."""
     x = np.asarray(x)
     return x.astype(np.float64) if x.dtype.kind == "f" else x

@@ -228,7 +228,7 @@ class Builder:
             k -= self.values[number].size
         raise AssertionError("an index past the end of a take's arguments")
 
-    def run(self, closed: Any, args: Sequence[int]) -> list[int]:
+    def run(self, closed: core.ClosedJaxpr, args: Sequence[int]) -> list[int]:
         """The results of a closed jaxpr.
 
         Raises:
@@ -239,7 +239,7 @@ class Builder:
             env[variable] = self.constant(constant)
         env |= dict(zip(jaxpr.invars, args, strict=True))
 
-        def read(atom: Any) -> int:
+        def read(atom: core.Var | core.Literal) -> int:
             return self.constant(atom.val) if isinstance(atom, core.Literal) else env[atom]
 
         for equation in jaxpr.eqns:
@@ -369,14 +369,14 @@ class Builder:
         return self._fold("add", kind, terms)
 
 
-def _broadcast(grids: Any, params: Any, out: tuple[int, ...]) -> np.ndarray:
+def _broadcast(grids: list[np.ndarray], params: dict[str, Any], out: tuple[int, ...]) -> np.ndarray:
     inner = [1] * len(out)
     for axis, size in zip(params["broadcast_dimensions"], grids[0].shape, strict=True):
         inner[axis] = size
     return np.broadcast_to(grids[0].reshape(inner), out)
 
 
-def _sliced(grids: Any, params: Any, out: tuple[int, ...]) -> np.ndarray:
+def _sliced(grids: list[np.ndarray], params: dict[str, Any], out: tuple[int, ...]) -> np.ndarray:
     ends = zip(
         params["start_indices"],
         params["limit_indices"],
@@ -387,7 +387,7 @@ def _sliced(grids: Any, params: Any, out: tuple[int, ...]) -> np.ndarray:
 
 
 # The frequent ones by NumPy, as JAX would compile each.
-_INDEXERS: dict[str, Callable[[Any, Any, tuple[int, ...]], np.ndarray]] = {
+_INDEXERS: dict[str, Callable[[list[np.ndarray], dict[str, Any], tuple[int, ...]], np.ndarray]] = {
     "reshape": lambda grids, params, out: grids[0].reshape(out),
     "squeeze": lambda grids, params, out: grids[0].reshape(out),
     "slice": _sliced,

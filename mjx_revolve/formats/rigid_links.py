@@ -24,6 +24,7 @@ from mjx_revolve.inputs.files import read_file
 from mjx_revolve.numerics.spatial import quat_to_matrix
 
 Place = tuple[np.ndarray, np.ndarray]  # position [3] [m] and rotation [3, 3]
+_Hinge = tuple[np.ndarray, np.ndarray, dict[str, Any]]  # axis, anchor [m] and limits
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class RigidRobot:
     links: list[RigidLink] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
 
-    def _add(self, parent: int, place: Place, name: str, hinge: Any) -> tuple[int, Place]:
+    def _add(self, parent: int, place: Place, name: str, hinge: _Hinge | None) -> tuple[int, Place]:
         """A link's number, and its place in that one's frame; without a hinge, its parent's."""
         if parent >= 0 and hinge is None:
             return parent, place
@@ -340,7 +341,7 @@ def _load_mesh(name: str, path: Path) -> np.ndarray | None:
         return None
 
 
-def _urdf_hinge(joint: Element, missing: list[str]) -> Any:
+def _urdf_hinge(joint: Element, missing: list[str]) -> _Hinge | None:
     """Axis, anchor and limits of a joint; None if it is rigid here."""
     name, kind = joint.get("name", ""), joint.get("type")
     if kind not in ("revolute", "continuous"):
@@ -416,7 +417,7 @@ def _read_mjcf(root: Element, path: Path) -> RigidRobot:
     return robot
 
 
-def _mjcf_hinge(model: mujoco.MjModel, body: int, missing: list[str]) -> tuple[Any, str]:
+def _mjcf_hinge(model: mujoco.MjModel, body: int, missing: list[str]) -> tuple[_Hinge | None, str]:
     """Axis, anchor and limits of a body's first hinge and its name; None without one."""
     first = int(model.body_jntadr[body])
     joints = range(first, first + int(model.body_jntnum[body]))

@@ -57,7 +57,7 @@ def find_genotype(
     return genotype
 
 
-def _guard(name: str, genotype: Any, space: Space) -> Genotype:
+def _guard(name: str, genotype: object, space: Space) -> Genotype:
     """A user's genotype, with each error in its functions turned into one line."""
     place = function_place(name)
     if not isinstance(genotype, Genotype):
@@ -69,7 +69,7 @@ def _guard(name: str, genotype: Any, space: Space) -> Genotype:
 
     grow = guarded("develop")
 
-    def develop(genome: Any) -> Morphology:
+    def develop(genome: object) -> Morphology:
         body = grow(genome)
         reason: str | None = f"expected a Morphology; found {type(body).__name__}"
         if isinstance(body, Morphology):

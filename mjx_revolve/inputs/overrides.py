@@ -11,7 +11,7 @@ from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.yaml_reader import SafeLoader
 
 
-def copy_plain(value: Any) -> Any:
+def copy_plain(value: object) -> Any:
     """A deep copy of plain YAML values; tuples (from code) become lists."""
     if isinstance(value, Mapping):
         return {key: copy_plain(item) for key, item in value.items()}
@@ -47,7 +47,7 @@ def read_overrides(overrides: Mapping[str, object] | Sequence[str]) -> tuple[dic
 
 
 def merge_override(
-    data: dict[str, Any], key: str, value: Any, label: str, named: Sequence[str] = ()
+    data: dict[str, Any], key: str, value: object, label: str, named: Sequence[str] = ()
 ) -> None:
     """Sets one dotted key of nested mappings, in place; a mapping is merged into a mapping.
 

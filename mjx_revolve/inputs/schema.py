@@ -63,7 +63,7 @@ def _plain(value: Any) -> Any:
     return value.item() if getattr(value, "shape", None) == () else value
 
 
-def as_tuple(value: Any) -> Any:
+def as_tuple(value: object) -> Any:
     """Lists and arrays as tuples; other values as they are."""
     if isinstance(value, tuple | str | bytes):
         return value
@@ -194,7 +194,7 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
-def read(kind: Any, value: object, place: str = "", context: object = None) -> Any:
+def read(kind: object, value: object, place: str = "", context: object = None) -> Any:
     """Reads a user's value as a type.
 
     Args:

@@ -38,7 +38,7 @@ _MAX_NAMES = 100
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 
 
-def find_problems(error: ValidationError, kind: Any, data: object) -> dict[str, str]:
+def find_problems(error: ValidationError, kind: object, data: object) -> dict[str, str]:
     """Pydantic's errors as "expected X; found Y" by place, the first of each.
 
     Args:
@@ -56,7 +56,7 @@ def find_problems(error: ValidationError, kind: Any, data: object) -> dict[str, 
     return problems
 
 
-def _problem(error: ErrorDetails, kind: Any, data: Any) -> tuple[str, str]:
+def _problem(error: ErrorDetails, kind: object, data: Any) -> tuple[str, str]:
     """The place of an error, and "expected X; found Y"."""
     steps = list(error["loc"])
     names = list(fields_of(kind))
@@ -119,7 +119,7 @@ def fields_of(kind: object) -> dict[str, FieldInfo]:
     return getattr(kind, "model_fields", None) or getattr(kind, "__pydantic_fields__", {})
 
 
-def _open(annotation: Any) -> tuple[Any, list[Any], bool]:
+def _open(annotation: object) -> tuple[Any, list[Any], bool]:
     """A type itself, its metadata (outer ones last), and whether it may be None."""
     metadata: list[Any] = []
     optional = False
@@ -142,7 +142,7 @@ def _is_union(annotation: object) -> bool:
     return get_origin(annotation) in (Union, types.UnionType)
 
 
-def _follow(annotation: Any, steps: Sequence[Step]) -> tuple[list[Step], Any]:
+def _follow(annotation: object, steps: Sequence[Step]) -> tuple[list[Step], Any]:
     """As many steps as can be followed into a type, and the annotation there."""
     taken: list[Step] = []
     for step in steps:

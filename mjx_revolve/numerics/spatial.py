@@ -190,7 +190,7 @@ def safe_norm(a: Vec) -> Scalar:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
-def namespace(x: Any) -> Any:
+def namespace(x: object) -> Any:
     """The functions for an array: NumPy's for NumPy's own, else JAX's.
 
     Building a robot is done in NumPy: it happens once, and JAX would compile a program for each

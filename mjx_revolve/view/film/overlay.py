@@ -33,7 +33,7 @@ _SPACE, _DOT = 0.012, 0.0032
 _WHITE, _SHADE, _SOFT = (255, 255, 255, 245), (4, 28, 44, 150), (226, 240, 246, 235)
 AIM, FLOW = ((*(round(255 * x) for x in color), 255) for color in (TARGET, CURRENT))
 
-Overlay = Callable[[Any, np.ndarray, int], np.ndarray]
+Overlay = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
 _Dots = Callable[[np.ndarray, np.ndarray, int], None]
 _Words = Callable[["Pen", int], None]
 
@@ -56,7 +56,7 @@ def make_overlay(film: Film) -> Overlay:
         layers.append(_make_rings(film, film.notes))
         words = _make_colony_words(film, film.notes)
 
-    def overlay(picture: Any, depth: np.ndarray, frame: int) -> np.ndarray:
+    def overlay(picture: np.ndarray, depth: np.ndarray, frame: int) -> np.ndarray:
         picture = np.array(picture)
         for layer in layers:
             layer(picture, depth, frame)

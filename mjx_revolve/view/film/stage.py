@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -121,7 +120,7 @@ def _add_pieces(spec: mujoco.MjSpec, robot: Robot) -> None:
 
 
 def _add_mesh(
-    spec: mujoco.MjSpec, name: str, vertices: np.ndarray, faces: np.ndarray, **more: Any
+    spec: mujoco.MjSpec, name: str, vertices: np.ndarray, faces: np.ndarray, **more: object
 ) -> None:
     """Triangles `[m, 3]` between points `[n, 3]` [m]."""
     # Thin or open parts have no volume to speak of; their inertia is not used.

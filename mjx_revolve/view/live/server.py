@@ -56,7 +56,7 @@ class LiveServer(ThreadingHTTPServer):
         self.closing = threading.Event()
         self._room = threading.Semaphore(_MAX_CONNECTIONS)
 
-    def process_request(self, request: Any, client_address: Any) -> None:
+    def process_request(self, request: Any, client_address: object) -> None:
         """Answers in a thread of its own, as long as there are not too many."""
         if self._room.acquire(blocking=False):
             super().process_request(request, client_address)
@@ -65,7 +65,7 @@ class LiveServer(ThreadingHTTPServer):
                 request.sendall(b"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\n\r\n")
             self.shutdown_request(request)
 
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
+    def process_request_thread(self, request: Any, client_address: object) -> None:
         """Answers, and makes room for another connection."""
         try:
             super().process_request_thread(request, client_address)
@@ -83,7 +83,7 @@ class LiveServer(ThreadingHTTPServer):
         """Of the page."""
         return f"{self.origins[0]}/{self.token}/"
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
+    def handle_error(self, request: object, client_address: object) -> None:
         """Logs no pages that were closed."""
 
 

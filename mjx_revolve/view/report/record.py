@@ -97,7 +97,7 @@ class RunRecord:
         except (InputError, OverflowError) as error:
             self.note("damaged", str(error))
 
-    def setting(self, path: str, default: Any = None) -> Any:
+    def setting(self, path: str, default: object = None) -> Any:
         """A setting by its dotted name; the default where nothing is known."""
         data: Any = self.settings if self.config is None else self.config.model_dump()
         for part in path.split("."):
