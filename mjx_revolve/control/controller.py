@@ -47,7 +47,19 @@ class Gene(NamedTuple):
     number: int = 0
 
 
-class Controller(NamedTuple):
+class _Controller(NamedTuple):
+    num_genes: int
+    gene_names: tuple[str, ...]
+    decode: Callable[[jax.Array, Plant], PyTree]
+    init: Callable[[PyTree], PyTree]
+    step: Callable[[PyTree, PyTree, jax.Array, SensorReadings], StepOutput]
+    genes: tuple[Gene, ...] = ()
+    signals: tuple[str, ...] = ()
+    observer: Observer | None = None
+    rate: float | None = None
+
+
+class Controller(_Controller):
     """Functions that turn genes into commands.
 
     Attributes:
@@ -66,15 +78,19 @@ class Controller(NamedTuple):
             new command at every step.
     """
 
-    num_genes: int
-    gene_names: tuple[str, ...]
-    decode: Callable[[jax.Array, Plant], PyTree]
-    init: Callable[[PyTree], PyTree]
-    step: Callable[[PyTree, PyTree, jax.Array, SensorReadings], StepOutput]
-    genes: tuple[Gene, ...] = ()
-    signals: tuple[str, ...] = ()
-    observer: Observer | None = None
-    rate: float | None = None
+    __slots__ = ()
+
+    def __new__(cls, *args: Any, feels: tuple[str, ...] | None = None, **kwargs: Any) -> Controller:
+        """`feels` is the old name of `signals`, for one more release."""
+        if feels is not None:
+            kwargs["signals"] = feels
+        return super().__new__(cls, *args, **kwargs)
+
+    def _replace(self, **kwargs: Any) -> Controller:
+        """A copy with other fields."""
+        if "feels" in kwargs:
+            kwargs["signals"] = kwargs.pop("feels")
+        return super()._replace(**kwargs)
 
 
 @dataclass(frozen=True)

@@ -187,6 +187,16 @@ class SensorReadings(NamedTuple):
     present: jax.Array | None = None
     cells: tuple[jax.Array, jax.Array] | None = None
 
+    @property
+    def spin(self) -> Vec:
+        """Old name of `angular_velocity`, for one more release."""
+        return self.angular_velocity
+
+    @property
+    def places(self) -> Any:
+        """Old name of `modules`, for one more release."""
+        return self.modules
+
 
 class _Frame(NamedTuple):
     """Pose and motion of the core or of modules, `[..., lanes]` each.

@@ -8,10 +8,13 @@ from pathlib import Path
 from mjx_revolve.evolution.colony_observer import ObservedRobot, observe_colony, open_colony
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.recording import Mark, Recording, ReplayRobot
+from mjx_revolve.view.viewer import write_colony_page as write_colony_page
 
 _GAP = 0.05  # from pose to pose [s]; what lies between is interpolated. A choice.
 DURATION = 60.0
 """How long a colony is recorded by default [s]."""
+Actor = ReplayRobot
+"""The old name, for one more release; so does `write_colony_page` stand here, too."""
 _CAUSES = {"age": "of age", "energy": "of an empty battery"}
 
 
