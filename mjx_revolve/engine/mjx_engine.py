@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_revolve.engine import forces, population
-from mjx_revolve.engine.dynamics import inertia_and_momentum, with_bed
-from mjx_revolve.engine.hydrodynamics import PreviousStep, water_forces
+from mjx_revolve.engine.dynamics import inertia_and_momentum, midpoint_forces, with_bed
+from mjx_revolve.engine.hydrodynamics import PreviousStep
 from mjx_revolve.engine.kinematics import body_motions, center_of_mass
 from mjx_revolve.engine.plant import Plant, plant_of
 from mjx_revolve.engine.robot import Robot, check_timestep, import_mjx
@@ -420,13 +420,13 @@ def _add_water(
         x_axis=column(axes[:, 0]),
         y_axis=column(axes[:, 1]),
         xy=(place[:, 0, None], place[:, 1, None]),
-        midpoint=midpoint,
+        midpoint=midpoint if tree.carries else None,
     )
     upwards = flow.acceleration + jnp.array([0.0, 0.0, world.gravity], flow.qpos.dtype)
     gravity = column(jnp.einsum("bji,j->bi", axes, upwards))
     pushes = thrusts[:, None] if tree.thrusters.count else ()
     before = PreviousStep(tuple(x[..., None] for x in submerged), dt) if submerged else None
-    external = water_forces(world, constants, motion, gravity, water, pushes, before)
+    external = midpoint_forces(world, constants, motion, gravity, water, pushes, before, dt)
     external = with_bed(world, constants, motion, external, water)
     n = constants.count
     wrench = jnp.concatenate([_stack(external.torque, n), _stack(external.force, n)], -1)
@@ -493,14 +493,17 @@ def _add_servos(
 def _advance(plan: MjxEngine, flow: _Flow, rates: Any, current: Any) -> tuple[Any, Any, Any]:
     """The end of a step: semi-implicit Euler, as `state.integrate`."""
     dt, new, turn = plan.dt, flow.qvel + plan.dt * rates, _rows(flow.qpos)
+    way = new
     ahead, before = flow.ahead, turn.T @ flow.qvel[:3]
     qacc_prev = rates.at[:3].set(turn.T @ rates[:3] - jnp.cross(ahead[3:6], turn.T @ ahead[:3]))
     if plan.tree.carries:
         quat = integrate_quat(tuple(flow.qpos[3:7]), tuple(new[3:6]), dt)
         turned = jnp.stack([jnp.stack(r) for r in quat_to_mat(quat)])
-        new = new.at[:3].set(turned @ (before + dt * qacc_prev[:3]))
-    new = new.at[:3].add(current + dt * flow.acceleration)
-    return _moved(flow.qpos, new, jnp.asarray(dt, flow.qpos.dtype)), new, qacc_prev
+        seen = before + dt * qacc_prev[:3]
+        new = new.at[:3].set(turned @ seen)
+        way = way.at[:3].set(0.5 * (turn + turned) @ seen)
+    new, way = (v.at[:3].add(current + dt * flow.acceleration) for v in (new, way))
+    return _moved(flow.qpos, way, jnp.asarray(dt, flow.qpos.dtype)), new, qacc_prev
 
 
 def _moved(qpos: Any, qvel: Any, time: Any) -> Any:

@@ -130,14 +130,17 @@ def integrate(
         # Momentum is kept in the body's frame, so velocity turns with it.
         ahead = tuple(v + dt * a for v, a in zip(seen, linear, strict=True))
         velocity = vadd(matvec(quat_to_mat(quat), ahead), water.current)
+        # It moves by the mean of its directions before and after: second order.
+        before = vadd(matvec(rotation, ahead), water.current)
+        way = vscale(0.5, vadd(before, velocity))
     else:
         # As MuJoCo: the body-frame rate and the frame's turning make the world's acceleration.
         push = matvec(rotation, vadd(linear, cross(state.angular_velocity, seen)))
-        velocity = vadd(state.velocity, vscale(dt, push))
+        way = velocity = vadd(state.velocity, vscale(dt, push))
     if has_acceleration(water):
-        velocity = vadd(velocity, vscale(dt, water.acceleration))
+        velocity, way = (vadd(v, vscale(dt, water.acceleration)) for v in (velocity, way))
     return state._replace(
-        position=tuple(x + dt * v for x, v in zip(state.position, velocity, strict=True)),
+        position=tuple(x + dt * v for x, v in zip(state.position, way, strict=True)),
         quat=quat,
         velocity=velocity,
         angular_velocity=angular_velocity,
