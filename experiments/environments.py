@@ -54,13 +54,7 @@ ENVIRONMENTS: dict[str, Case] = {
     ),
     "bed": Case(
         "on the lake's bed; bodies are not trimmed, so they sink",
-        (
-            "world=lake",
-            "trim=none",
-            "task.type=crawl",
-            "task.horizon=null",
-            "task.start_attitude=level",
-        ),
+        ("world=lake", "trim=none", "task.type=crawl", "task.start_attitude=level"),
     ),
     "current": Case(
         f"2 m below the lake's surface in a current of {CURRENT:g} m/s; progress against it counts",

@@ -9,14 +9,18 @@ Spatial quantities are (angular, linear), in each body's own frame, about its ow
 
 from __future__ import annotations
 
-import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from mjx_revolve.engine.contact import bed_forces
-from mjx_revolve.engine.hydrodynamics import ExternalForces, PreviousStep, water_forces
+from mjx_revolve.engine.hydrodynamics import (
+    ExternalForces,
+    PreviousStep,
+    implicit_share,
+    water_forces,
+)
 from mjx_revolve.engine.kinematics import body_frames, forward_kinematics
 from mjx_revolve.engine.level import Hinges, Level
 from mjx_revolve.engine.self_contact import (
@@ -47,7 +51,6 @@ from mjx_revolve.numerics.spatial import (
     cross,
     dot,
     full,
-    is_present,
     matTvec,
     matvec,
     mul,
@@ -66,8 +69,6 @@ from mjx_revolve.water.world import World
 
 _NO_MATRIX = ((0.0,) * 3,) * 3
 _NO_BLOCK = Block(_NO_MATRIX, _NO_MATRIX, _NO_MATRIX, _NO_MATRIX)
-# Added to inertias that are divided by, as those of bodies that stand for none [kg·m², kg].
-_TINY = 1e-12
 _NO_BIAS = ((0.0,) * 3, (0.0,) * 3)
 
 
@@ -106,6 +107,13 @@ def accelerate(
     meets = tree.meets and dt > 0
     located = has_acceleration(water) or needs_horizontal_position(world) or tree.touches
     root, moved, midpoint_speed = forward_kinematics(tree, state, located, dt)
+    if symmetric:
+        midpoint_speed = state.speed
+
+    def turning(motion: BodyMotion) -> tuple[Vec, Vec]:
+        """The velocity with which momenta turn: as MuJoCo's step has it, the step's first one."""
+        first = motion.angular_velocity, motion.velocity
+        return first if symmetric else motion.midpoint_velocity
 
     def articulate(level: Level, children: Any, moved: Any, *xs: Any) -> tuple[Any, Any, Scalar]:
         """Articulated inertia and bias of bodies, seen from their parents; the root's own."""
@@ -117,7 +125,9 @@ def accelerate(
         external = midpoint_forces(world, level, motion, gravity, water, thrusts, before, dt)
         external = with_bed(world, level, motion, external, water)
         submerged = external.submerged
-        block, bias = _inertia_and_bias(level, motion, external, gravity, dt, push, symmetric)
+        block, bias = _inertia_and_bias(
+            level, motion, turning(motion), external, gravity, dt, push, symmetric
+        )
         found = _flatten(block, bias, symmetric)
         if children is not None:
             found = jax.tree.map(add, found, children)
@@ -136,7 +146,7 @@ def accelerate(
             bias,
             add(inertia, motor_inertia),
             add(motor, load),
-            _coriolis(motion.midpoint_velocity, midpoint_speed),
+            _coriolis(turning(motion), midpoint_speed),
             symmetric,
         )
         block, bias = to_parent(rotation, level.hinges.position, block, bias, symmetric)
@@ -160,7 +170,7 @@ def accelerate(
         (motion, rotation), midpoint_speed, (joint, *_) = x
         assert level.hinges is not None
         angular, linear = parent
-        coriolis = _coriolis(motion.midpoint_velocity, midpoint_speed)
+        coriolis = _coriolis(turning(motion), midpoint_speed)
         a = vadd(matTvec(rotation, angular), coriolis[0])
         position = level.hinges.position
         b = vadd(matTvec(rotation, vadd(linear, cross(angular, position))), coriolis[1])
@@ -319,14 +329,12 @@ def midpoint_forces(
 ) -> ExternalForces:
     """`water_forces` in the middle of the step, and what damps them as far as a step needs it.
 
-    They are those of the velocity ν + dt/2 ν'₋, with the acceleration ν'₋ of the step before:
-    second order, but unstable for a body that the water slows down within a step. So they fall by
-    s D dt (ν' - ν'₋) with the acceleration ν' that is sought, D the half of the forces' gradient
-    that the laws give: second order for every share s, whatever D leaves out, and linearly implicit
-    with s = 1. With z the largest ratio of 2 D dt to the inertia along an axis, it is stable for
-    z (1 - s) < 1; s = z²/(1 + z²) leaves half of that. Where motion is well resolved, s is small:
-    joints' accelerations jump with their commands, and what D leaves out then adds up to an error
-    of first order.
+    They are those of the velocity ν + (1 - s) dt/2 ν'₋, with the acceleration ν'₋ of the step
+    before, and fall by s dt D ν' with the acceleration ν' that is sought; D is the half of the
+    forces' gradient that the laws give. Without the share s that is second order, but unstable for
+    a body that the water slows down within a step; s = 1 is linearly implicit, stable, and of first
+    order in what D leaves out: joints' accelerations jump with their commands. See
+    `implicit_share`. The slam takes what the step begins with: momentum is then kept.
 
     Args:
         world, level, gravity, water, thrusts, before: as in `water_forces`.
@@ -336,30 +344,21 @@ def midpoint_forces(
     Returns:
         Forces, torques and inertias; `damping` times dt adds to the inertia.
     """
-    middle = motion.midpoint
-    if not middle or not dt:
+    if not motion.midpoint or not dt:
         return water_forces(world, level, motion, gravity, water, thrusts, before)
-    ahead = motion._replace(angular_velocity=middle[0], velocity=middle[1])
+    share = implicit_share(world, level, motion, dt)
+    angular, linear = (
+        vadd(v, vscale(sub(1, share), vsub(middle, v)))
+        for v, middle in zip(
+            (motion.angular_velocity, motion.velocity), motion.midpoint, strict=True
+        )
+    )
+    begun = motion.angular_velocity, motion.velocity
+    ahead = motion._replace(angular_velocity=angular, velocity=linear, begun=begun)
     external = water_forces(world, level, ahead, gravity, water, thrusts, before)
     if external.damping is None:
         return external
-    _, inertia, _ = inertia_and_momentum(level, external, middle)
-    pairs = (
-        (damping[i], mass[i])
-        for damping, mass in zip(external.damping[::2], inertia[::2], strict=True)
-        for i in (0, 3, 5)
-    )
-    ratios = [mul(2 * dt, d) / add(_TINY, m) for d, m in pairs if is_present(d)]
-    if not ratios:
-        return external
-    fastest = functools.reduce(jnp.maximum, ratios)
-    square = fastest * fastest
-    damping = scale_inertia(square / (1 + square), external.damping)
-    gained = vsub(middle[0], motion.angular_velocity), vsub(middle[1], motion.velocity)
-    torque, force = apply_inertia(scale_inertia(2.0, damping), *gained)
-    return external._replace(
-        torque=vadd(external.torque, torque), force=vadd(external.force, force), damping=damping
-    )
+    return external._replace(damping=scale_inertia(share, external.damping))
 
 
 def with_bed(
@@ -402,6 +401,7 @@ def inertia_and_momentum(
 def _inertia_and_bias(
     level: Level,
     motion: BodyMotion,
+    turning: tuple[Vec, Vec],
     external: ExternalForces,
     gravity: Vec,
     dt: float,
@@ -417,7 +417,7 @@ def _inertia_and_bias(
     torque = vadd(external.torque, cross(level.moment, weight))
     if wrench:
         torque, force = vadd(torque, wrench[0]), vadd(force, wrench[1])
-    _, inertia, momentum = inertia_and_momentum(level, external, motion.midpoint_velocity)
+    _, inertia, momentum = inertia_and_momentum(level, external, turning)
     if external.damping is not None and dt:
         inertia = add_inertia(inertia, scale_inertia(dt, external.damping))
     block = block_of(inertia)

@@ -41,7 +41,7 @@ class State(NamedTuple):
             below the root, or `[rows, 1, lanes]` [rad].
         speed: of the hinges, as `angle` [rad/s].
         qacc_prev: accelerations of the step before, (linear, angular, hinges); the root's as rates
-            of its body-frame velocities; empty without added mass.
+            of its body-frame velocities; empty outside of steps.
         command: of the thrusters, behind their lag, `[nthruster, lanes]` [-]; empty without.
         submerged: submerged fractions of the parts with added mass at the step before, by groups:
             (the root's `[npart, 1, lanes]`, those of the bodies below it: `[npart, nbody, lanes]`
@@ -146,7 +146,7 @@ def integrate(
         angular_velocity=angular_velocity,
         angle=jax.tree.map(forward, state.angle, speed),
         speed=speed,
-        qacc_prev=qacc if carries else (),
+        qacc_prev=qacc,
     )
 
 
