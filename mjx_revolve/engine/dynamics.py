@@ -15,7 +15,12 @@ import jax
 import jax.numpy as jnp
 
 from mjx_revolve.engine.contact import bed_forces
-from mjx_revolve.engine.hydrodynamics import ExternalForces, PreviousStep, water_forces
+from mjx_revolve.engine.hydrodynamics import (
+    ExternalForces,
+    PreviousStep,
+    implicit_share,
+    water_forces,
+)
 from mjx_revolve.engine.kinematics import body_frames, forward_kinematics
 from mjx_revolve.engine.level import Hinges, Level
 from mjx_revolve.engine.self_contact import (
@@ -102,6 +107,13 @@ def accelerate(
     meets = tree.meets and dt > 0
     located = has_acceleration(water) or needs_horizontal_position(world) or tree.touches
     root, moved, midpoint_speed = forward_kinematics(tree, state, located, dt)
+    if symmetric:
+        midpoint_speed = state.speed
+
+    def turning(motion: BodyMotion) -> tuple[Vec, Vec]:
+        """The velocity with which momenta turn: as MuJoCo's step has it, the step's first one."""
+        first = motion.angular_velocity, motion.velocity
+        return first if symmetric else motion.midpoint_velocity
 
     def articulate(level: Level, children: Any, moved: Any, *xs: Any) -> tuple[Any, Any, Scalar]:
         """Articulated inertia and bias of bodies, seen from their parents; the root's own."""
@@ -110,10 +122,12 @@ def accelerate(
         submerged = rest.pop() if state.submerged else ()
         gravity = effective_gravity(world, water, motion)
         before = PreviousStep(submerged, dt) if submerged and dt else None
-        external = water_forces(world, level, motion, gravity, water, thrusts, before)
+        external = midpoint_forces(world, level, motion, gravity, water, thrusts, before, dt)
         external = with_bed(world, level, motion, external, water)
         submerged = external.submerged
-        block, bias = _inertia_and_bias(level, motion, external, gravity, dt, push, symmetric)
+        block, bias = _inertia_and_bias(
+            level, motion, turning(motion), external, gravity, dt, push, symmetric
+        )
         found = _flatten(block, bias, symmetric)
         if children is not None:
             found = jax.tree.map(add, found, children)
@@ -132,7 +146,7 @@ def accelerate(
             bias,
             add(inertia, motor_inertia),
             add(motor, load),
-            _coriolis(motion.midpoint_velocity, midpoint_speed),
+            _coriolis(turning(motion), midpoint_speed),
             symmetric,
         )
         block, bias = to_parent(rotation, level.hinges.position, block, bias, symmetric)
@@ -156,7 +170,7 @@ def accelerate(
         (motion, rotation), midpoint_speed, (joint, *_) = x
         assert level.hinges is not None
         angular, linear = parent
-        coriolis = _coriolis(motion.midpoint_velocity, midpoint_speed)
+        coriolis = _coriolis(turning(motion), midpoint_speed)
         a = vadd(matTvec(rotation, angular), coriolis[0])
         position = level.hinges.position
         b = vadd(matTvec(rotation, vadd(linear, cross(angular, position))), coriolis[1])
@@ -303,6 +317,50 @@ def _sweep(level: Level, step: Scalar) -> Scalar:
     return mul(level.hinges.lever, jnp.abs(step))
 
 
+def midpoint_forces(
+    world: World,
+    level: Level,
+    motion: BodyMotion,
+    gravity: Vec,
+    water: Water,
+    thrusts: Any,
+    before: PreviousStep | None,
+    dt: float,
+) -> ExternalForces:
+    """`water_forces` in the middle of the step, and what damps them as far as a step needs it.
+
+    They are those of the velocity ν + (1 - s) dt/2 ν'₋, with the acceleration ν'₋ of the step
+    before, and fall by s dt D ν' with the acceleration ν' that is sought; D is the half of the
+    forces' gradient that the laws give. Without the share s that is second order, but unstable for
+    a body that the water slows down within a step; s = 1 is linearly implicit, stable, and of first
+    order in what D leaves out: joints' accelerations jump with their commands. See
+    `implicit_share`. The slam takes what the step begins with: momentum is then kept.
+
+    Args:
+        world, level, gravity, water, thrusts, before: as in `water_forces`.
+        motion: of the bodies, half a step ahead, too; without, all is as at its beginning.
+        dt: of the step [s]; 0 for none.
+
+    Returns:
+        Forces, torques and inertias; `damping` times dt adds to the inertia.
+    """
+    if not motion.midpoint or not dt:
+        return water_forces(world, level, motion, gravity, water, thrusts, before)
+    share = implicit_share(world, level, motion, dt)
+    angular, linear = (
+        vadd(v, vscale(sub(1, share), vsub(middle, v)))
+        for v, middle in zip(
+            (motion.angular_velocity, motion.velocity), motion.midpoint, strict=True
+        )
+    )
+    begun = motion.angular_velocity, motion.velocity
+    ahead = motion._replace(angular_velocity=angular, velocity=linear, begun=begun)
+    external = water_forces(world, level, ahead, gravity, water, thrusts, before)
+    if external.damping is None:
+        return external
+    return external._replace(damping=scale_inertia(share, external.damping))
+
+
 def with_bed(
     world: World, level: Level, motion: BodyMotion, external: ExternalForces, water: Water
 ) -> ExternalForces:
@@ -343,6 +401,7 @@ def inertia_and_momentum(
 def _inertia_and_bias(
     level: Level,
     motion: BodyMotion,
+    turning: tuple[Vec, Vec],
     external: ExternalForces,
     gravity: Vec,
     dt: float,
@@ -358,7 +417,7 @@ def _inertia_and_bias(
     torque = vadd(external.torque, cross(level.moment, weight))
     if wrench:
         torque, force = vadd(torque, wrench[0]), vadd(force, wrench[1])
-    _, inertia, momentum = inertia_and_momentum(level, external, motion.midpoint_velocity)
+    _, inertia, momentum = inertia_and_momentum(level, external, turning)
     if external.damping is not None and dt:
         inertia = add_inertia(inertia, scale_inertia(dt, external.damping))
     block = block_of(inertia)

@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_revolve.engine import forces, population
-from mjx_revolve.engine.dynamics import inertia_and_momentum, with_bed
-from mjx_revolve.engine.hydrodynamics import PreviousStep, water_forces
+from mjx_revolve.engine.dynamics import inertia_and_momentum, midpoint_forces, with_bed
+from mjx_revolve.engine.hydrodynamics import PreviousStep
 from mjx_revolve.engine.kinematics import body_motions, center_of_mass
 from mjx_revolve.engine.plant import Plant, plant_of
 from mjx_revolve.engine.robot import Robot, check_timestep, import_mjx
@@ -52,7 +52,7 @@ class MjxState(NamedTuple):
         qpos: `[nq, lanes]`.
         qvel: `[nv, lanes]`.
         qacc_prev: `[nv, lanes]` accelerations of the step before, the root's as rates of its
-            body-frame velocities; None without added mass.
+            body-frame velocities.
         command: of the thrusters, behind their lag, `[nthruster, lanes]` [-].
         submerged: submerged fractions at the step before, `[npart, nbody, lanes]` of each group of
             each level [-].
@@ -83,7 +83,7 @@ class _Flow(NamedTuple):
     Attributes:
         qpos: `[nq]`.
         qvel: `[nv]`.
-        ahead: `[nv]` half a step ahead, for momenta that turn.
+        ahead: `[nv]` half a step ahead, for the water's forces and momenta that turn.
         acceleration: `[3]` of the current [m/s²].
         drift: spatial acceleration of each level's bodies when no joint accelerates, `[nbody, 6]`.
     """
@@ -147,7 +147,7 @@ class MjxEngine:
         """The state of a population, thrusters at rest."""
         length = jnp.sqrt(jnp.sum(qpos[3:7] ** 2, 0))
         command = jnp.zeros((self.tree.thrusters.count, *qpos.shape[1:]), qpos.dtype)
-        qacc_prev = jnp.zeros_like(qvel) if self.tree.carries else None
+        qacc_prev = jnp.zeros_like(qvel)
         root, below = self.tree.fully_submerged(qpos.shape[1:], qpos.dtype)
         return MjxState(qpos.at[3:7].divide(length), qvel, qacc_prev, command, (root, *below))
 
@@ -173,7 +173,6 @@ class MjxEngine:
         qpos, qvel, qacc_prev, submerged, power = jax.vmap(single, in_axes=-1, out_axes=-1)(
             given, (qpos, qvel, qacc_prev, submerged, ctrl, thrusts)
         )
-        qacc_prev = qacc_prev if self.tree.carries else None
         return MjxState(qpos, qvel, qacc_prev, command, submerged), power + pumped
 
     def _thrust(self, state: MjxState, ctrl: jax.Array) -> tuple[Any, Any, Any]:
@@ -345,10 +344,8 @@ def _start(
 ) -> tuple[Any, _Flow]:
     """What follows from pose and velocity; contacts see the velocity over the ground."""
     seen, qvel = qvel, qvel.at[:3].add(-current)
-    # Momenta that turn are taken half a step ahead (see `dynamics.accelerate`).
-    ahead = qvel
-    if qacc_prev is not None:
-        ahead = qvel + 0.5 * plan.dt * qacc_prev.at[:3].set(_rows(qpos) @ qacc_prev[:3])
+    # Momenta that turn, and the water's forces, are those half a step ahead (see `dynamics`).
+    ahead = qvel + 0.5 * plan.dt * qacc_prev.at[:3].set(_rows(qpos) @ qacc_prev[:3])
     # With carried water the bodies' own momenta turn with it, below; else MuJoCo's terms hold.
     moving = jnp.zeros_like(qvel) if plan.tree.carries else qvel
     data = mjx.make_data(model).replace(qpos=qpos, qvel=seen)
@@ -426,7 +423,7 @@ def _add_water(
     gravity = column(jnp.einsum("bji,j->bi", axes, upwards))
     pushes = thrusts[:, None] if tree.thrusters.count else ()
     before = PreviousStep(tuple(x[..., None] for x in submerged), dt) if submerged else None
-    external = water_forces(world, constants, motion, gravity, water, pushes, before)
+    external = midpoint_forces(world, constants, motion, gravity, water, pushes, before, dt)
     external = with_bed(world, constants, motion, external, water)
     n = constants.count
     wrench = jnp.concatenate([_stack(external.torque, n), _stack(external.force, n)], -1)
@@ -493,14 +490,19 @@ def _add_servos(
 def _advance(plan: MjxEngine, flow: _Flow, rates: Any, current: Any) -> tuple[Any, Any, Any]:
     """The end of a step: semi-implicit Euler, as `state.integrate`."""
     dt, new, turn = plan.dt, flow.qvel + plan.dt * rates, _rows(flow.qpos)
-    ahead, before = flow.ahead, turn.T @ flow.qvel[:3]
+    way = new
+    # The velocity with which momenta turn, as in `dynamics.accelerate`.
+    ahead = flow.ahead if plan.tree.carries else flow.qvel
+    before = turn.T @ flow.qvel[:3]
     qacc_prev = rates.at[:3].set(turn.T @ rates[:3] - jnp.cross(ahead[3:6], turn.T @ ahead[:3]))
     if plan.tree.carries:
         quat = integrate_quat(tuple(flow.qpos[3:7]), tuple(new[3:6]), dt)
         turned = jnp.stack([jnp.stack(r) for r in quat_to_mat(quat)])
-        new = new.at[:3].set(turned @ (before + dt * qacc_prev[:3]))
-    new = new.at[:3].add(current + dt * flow.acceleration)
-    return _moved(flow.qpos, new, jnp.asarray(dt, flow.qpos.dtype)), new, qacc_prev
+        seen = before + dt * qacc_prev[:3]
+        new = new.at[:3].set(turned @ seen)
+        way = way.at[:3].set(0.5 * (turn + turned) @ seen)
+    new, way = (v.at[:3].add(current + dt * flow.acceleration) for v in (new, way))
+    return _moved(flow.qpos, way, jnp.asarray(dt, flow.qpos.dtype)), new, qacc_prev
 
 
 def _moved(qpos: Any, qvel: Any, time: Any) -> Any:

@@ -206,7 +206,7 @@ def init(tree: Tree, qpos: jax.Array, qvel: jax.Array) -> State:
         angular_velocity=angular_velocity,
         angle=tree.joints_to_tree(qpos[7:]),
         speed=speed,
-        qacc_prev=jax.tree.map(jnp.zeros_like, rates) if tree.carries else (),
+        qacc_prev=jax.tree.map(jnp.zeros_like, rates),
         command=jnp.zeros((count, *lanes), qpos.dtype) if count else (),
         submerged=submerged if tree.carries or jax.tree.leaves(submerged) else (),
         clearance=jnp.full(lanes, -1, qpos.dtype) if tree.meets else (),

@@ -41,7 +41,7 @@ class State(NamedTuple):
             below the root, or `[rows, 1, lanes]` [rad].
         speed: of the hinges, as `angle` [rad/s].
         qacc_prev: accelerations of the step before, (linear, angular, hinges); the root's as rates
-            of its body-frame velocities; empty without added mass.
+            of its body-frame velocities; empty outside of steps.
         command: of the thrusters, behind their lag, `[nthruster, lanes]` [-]; empty without.
         submerged: submerged fractions of the parts with added mass at the step before, by groups:
             (the root's `[npart, 1, lanes]`, those of the bodies below it: `[npart, nbody, lanes]`
@@ -130,20 +130,23 @@ def integrate(
         # Momentum is kept in the body's frame, so velocity turns with it.
         ahead = tuple(v + dt * a for v, a in zip(seen, linear, strict=True))
         velocity = vadd(matvec(quat_to_mat(quat), ahead), water.current)
+        # It moves by the mean of its directions before and after: second order.
+        before = vadd(matvec(rotation, ahead), water.current)
+        way = vscale(0.5, vadd(before, velocity))
     else:
         # As MuJoCo: the body-frame rate and the frame's turning make the world's acceleration.
         push = matvec(rotation, vadd(linear, cross(state.angular_velocity, seen)))
-        velocity = vadd(state.velocity, vscale(dt, push))
+        way = velocity = vadd(state.velocity, vscale(dt, push))
     if has_acceleration(water):
-        velocity = vadd(velocity, vscale(dt, water.acceleration))
+        velocity, way = (vadd(v, vscale(dt, water.acceleration)) for v in (velocity, way))
     return state._replace(
-        position=tuple(x + dt * v for x, v in zip(state.position, velocity, strict=True)),
+        position=tuple(x + dt * v for x, v in zip(state.position, way, strict=True)),
         quat=quat,
         velocity=velocity,
         angular_velocity=angular_velocity,
         angle=jax.tree.map(forward, state.angle, speed),
         speed=speed,
-        qacc_prev=qacc if carries else (),
+        qacc_prev=qacc,
     )
 
 

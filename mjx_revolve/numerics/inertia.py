@@ -41,8 +41,10 @@ class BodyMotion(NamedTuple):
         x_axis: the world's x axis, body frame; None where no law needs the horizontal position.
         y_axis: the world's y axis, body frame, or None.
         xy: world x and y of the origin [m], or None.
-        midpoint: angular and linear velocity half a step ahead, for momenta that turn with the
-            body; None where no water is carried along.
+        midpoint: angular and linear velocity half a step ahead, for the water's forces and for
+            momenta that turn with the body; None outside of steps.
+        begun: angular and linear velocity at the step's beginning, where the velocity is another;
+            else None.
     """
 
     angular_velocity: Vec
@@ -53,6 +55,7 @@ class BodyMotion(NamedTuple):
     y_axis: Any
     xy: Any
     midpoint: Any = None
+    begun: Any = None
 
     @property
     def midpoint_velocity(self) -> tuple[Vec, Vec]:

@@ -19,6 +19,7 @@ OFF = PartDragLaw(
     summary="no drag",
     explicit=False,
     varied=True,
+    steepest=0.0,
     mjcf=Export("", missing="modules without drag next to others with it"),
     sdf=Export(""),
 )

@@ -125,6 +125,7 @@ FACES = PartDragLaw(
     summary="quadratic drag on the true faces of the parts, and against their turning",
     explicit=False,
     varied=True,
+    steepest=3.0,  # C_d of 1.05, and what modules state
     coefficients=(
         Coefficient(
             "drag_coefficient",

@@ -264,9 +264,9 @@ class Drag(NamedTuple):
     Attributes:
         force: [N].
         torque: [N·m].
-        damping: how fast the force along each axis falls with velocity [N·s/m], or how force and
-            torque fall with both velocities: a step takes it implicitly. None for a law that a step
-            takes explicitly.
+        damping: half of how fast the force along each axis falls with velocity [N·s/m], or of how
+            force and torque fall with both velocities: a step takes it implicitly where it must.
+            None for a law that a step takes explicitly.
     """
 
     force: Vec
@@ -289,6 +289,8 @@ class DragLaw:
         sdf: what an SDF file can say of it.
         explicit: whether a step takes it explicitly, which limits the time step.
         varied: whether `task.robust` varies it.
+        steepest: bound g of the force's gradient: its derivative by the speed v is at most g ρ A v,
+            with A the part's largest face. None where there is none: drag that is linear in v.
         coefficients: what users may give for it.
         parameters: checked class of more of them, which modules have under its name, and worlds
             where they have a field of this name.
@@ -301,6 +303,7 @@ class DragLaw:
     sdf: Export
     explicit: bool
     varied: bool
+    steepest: float | None = None
     coefficients: tuple[Coefficient, ...] = ()
     parameters: type | None = None
     mj_fluidcoef: tuple[float, ...] = ()

@@ -284,6 +284,7 @@ LIFT_DRAG = PartDragLaw(
     summary="Gazebo's lift and drag of a plate",
     explicit=False,
     varied=True,
+    steepest=10.0,  # lift: 2π, and drag
     parameters=LiftDrag,
     numbers=_plates_of,
     force=_plate_drag,
