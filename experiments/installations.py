@@ -4,9 +4,9 @@
 
 `lowest` has the lowest version of each package that `pyproject.toml` names, `newest` the newest of
 everything, `neighbours` brax, MuJoCo Playground, Stable-Baselines3 and QDax. In each: `pip check`,
-imports, the smoke run from an empty folder, and with `--tests` the quick tests, and beside
-neighbours the tests and examples that need them. Each takes minutes and up to 8 GB, in `--out`, and
-is removed afterwards.
+imports, the smoke run from an empty folder, and with `--tests` the quick tests, or beside
+neighbours, whose versions of the rest are the newest, the tests and examples that need them. Each
+takes minutes and up to 8 GB, in `--out`, and is removed afterwards.
 """
 
 from __future__ import annotations
@@ -26,16 +26,18 @@ from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
 
+QUICK = ("-m", "not slow and not long")
+DOORS = "test_doors or 13_ or 14_ or 15_ or 16_ or 17_"
 # What is installed besides this package, what is imported beside it, whose versions are named, and
-# more tests.
+# what is tested.
 COLUMNS: dict[str, tuple[tuple[str, ...], ...]] = {
-    "lowest": ((), (), ("mujoco", "jax", "numpy"), ()),
-    "newest": ((), (), ("mujoco", "jax", "numpy"), ()),
+    "lowest": ((), (), ("mujoco", "jax", "numpy"), QUICK),
+    "newest": ((), (), ("mujoco", "jax", "numpy"), QUICK),
     "neighbours": (
         ("brax", "playground", "stable-baselines3", "qdax", "gymnasium>=1.1", "ribs>=0.12,<0.13"),
         ("brax.envs", "mujoco_playground", "stable_baselines3", "qdax.core.map_elites"),
         ("brax", "playground", "stable-baselines3", "qdax", "ribs", "mujoco", "jax"),
-        ("tests/episodes/test_doors.py", "tests/test_examples.py"),
+        ("tests/episodes/test_doors.py", "tests/test_examples.py", "-k", DOORS),
     ),
 }
 STEPS = ("pip check", "imports", "smoke run", "quick tests", "doors and examples")
@@ -106,7 +108,7 @@ def measure(python: Path) -> dict[str, Any]:
 
 def try_column(name: str, folder: Path, tests: bool) -> dict[str, Any]:
     """Makes an environment and tries the package in it; a step that fails ends it."""
-    more, imports, _, doors = COLUMNS[name]
+    more, imports, _, tested = COLUMNS[name]
     pins = lowest_versions() if name == "lowest" else []
     python, empty = folder / name / "bin" / "python", folder / f"{name}_empty"
     shutil.rmtree(folder / name, ignore_errors=True)
@@ -124,9 +126,7 @@ def try_column(name: str, folder: Path, tests: bool) -> dict[str, Any]:
     if tests:
         pytest = (python, "-m", "pytest", "--numprocesses", "2", "--dist", "loadfile")
         steps["test tools"] = (*pip, *pins, *TOOLS)
-        steps["quick tests"] = (*pytest, "-m", "not slow and not long")
-        if doors:
-            steps["doors and examples"] = (*pytest, *doors)
+        steps["quick tests" if tested is QUICK else "doors and examples"] = (*pytest, *tested)
     found: dict[str, Any] = {}
     for step, command in steps.items():
         here = empty if step in ("imports", "smoke run") else ROOT
