@@ -4,8 +4,9 @@
 
 `lowest` has the lowest version of each package that `pyproject.toml` names, `newest` the newest of
 everything, `neighbours` brax, MuJoCo Playground, Stable-Baselines3 and QDax. In each: `pip check`,
-imports, the smoke run from an empty folder, and with `--tests` the quick tests. Each takes minutes
-and up to 8 GB, in `--out`, and is removed afterwards.
+imports, the smoke run from an empty folder, and with `--tests` the quick tests, or beside
+neighbours, whose versions of the rest are the newest, the tests and examples that need them. Each
+takes minutes and up to 8 GB, in `--out`, and is removed afterwards.
 """
 
 from __future__ import annotations
@@ -25,17 +26,55 @@ from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
 
-# What is installed besides this package, and what is imported beside it.
-COLUMNS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "lowest": ((), ()),
-    "newest": ((), ()),
+QUICK = ("-m", "not slow and not long")
+DOORS = "test_doors or 13_ or 14_ or 15_ or 16_ or 17_"
+# What is installed besides this package, what is imported beside it, whose versions are named, and
+# what is tested.
+COLUMNS: dict[str, tuple[tuple[str, ...], ...]] = {
+    "lowest": ((), (), ("mujoco", "jax", "numpy"), QUICK),
+    "newest": ((), (), ("mujoco", "jax", "numpy"), QUICK),
     "neighbours": (
-        ("brax", "playground", "stable-baselines3", "qdax", "gymnasium>=1.1"),
+        ("brax", "playground", "stable-baselines3", "qdax", "gymnasium>=1.1", "ribs>=0.12,<0.13"),
         ("brax.envs", "mujoco_playground", "stable_baselines3", "qdax.core.map_elites"),
+        ("brax", "playground", "stable-baselines3", "qdax", "ribs", "mujoco", "jax"),
+        ("tests/episodes/test_doors.py", "tests/test_examples.py", "-k", DOORS),
     ),
 }
-STEPS = ("pip check", "imports", "smoke run", "quick tests")
+STEPS = ("pip check", "imports", "smoke run", "quick tests", "doors and examples")
 TOOLS = ("pytest>=8", "pytest-xdist>=3.6", "hypothesis>=6.130", "pandas>=2.2")
+
+# What is installed, and how many distributions some of it cannot do without, itself included.
+_LOOK = """
+import json, re
+from importlib.metadata import distributions
+from packaging.requirements import Requirement
+
+def plain(name):
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+installed = {plain(one.metadata["Name"]): one for one in distributions()}
+
+def needed_by(*names):
+    found, todo = set(), [(name, "") for name in names]
+    while todo:
+        name, extra = one = todo.pop()
+        if one in found or name not in installed:
+            continue
+        found.add(one)
+        for need in map(Requirement, installed[name].requires or ()):
+            if need.marker is None or need.marker.evaluate({"extra": extra}):
+                todo += [(plain(need.name), more) for more in ("", *need.extras)]
+    return {name for name, _ in found}
+
+needs = [Requirement(line) for line in installed["mjx-revolve"].requires]
+direct = [plain(need.name) for need in needs if "extra" not in str(need.marker)]
+print(json.dumps({
+    "versions": {name: installed[name].version for name in sorted(installed)},
+    "evosax": len(needed_by("evosax")),
+    "evosax_and_mujoco": len(needed_by("evosax", "mujoco")),
+    "without_evosax": 1 + len(needed_by(*(name for name in direct if name != "evosax"))),
+}))
+"""
 
 
 def lowest_versions() -> list[str]:
@@ -55,24 +94,21 @@ def run(*command: str | Path, folder: Path = ROOT) -> tuple[bool, str]:
 
 def measure(python: Path) -> dict[str, Any]:
     """How many distributions an environment has, pip left out, and how large they are."""
-    script = (
-        "import json; from importlib.metadata import distributions as d; "
-        "print(json.dumps({x.metadata['Name']: x.version for x in d()}))"
-    )
-    done = subprocess.run([python, "-c", script], capture_output=True, text=True, check=True)
-    versions = json.loads(done.stdout)
-    versions = {k: versions[k] for k in sorted(versions) if k not in ("pip", "setuptools")}
+    done = subprocess.run([python, "-c", _LOOK], capture_output=True, text=True, check=True)
+    found = json.loads(done.stdout)
+    versions = {k: v for k, v in found["versions"].items() if k not in ("pip", "setuptools")}
     size = sum(
         path.stat().st_size
         for path in python.parent.parent.glob("lib/python*/site-packages/**/*")
         if path.is_file() and path.parts[-2] != "__pycache__"
     )
-    return {"distributions": len(versions), "megabytes": round(size / 1e6), "versions": versions}
+    sizes = {"distributions": len(versions), "megabytes": round(size / 1e6)}
+    return sizes | found | {"versions": versions}
 
 
 def try_column(name: str, folder: Path, tests: bool) -> dict[str, Any]:
     """Makes an environment and tries the package in it; a step that fails ends it."""
-    more, imports = COLUMNS[name]
+    more, imports, _, tested = COLUMNS[name]
     pins = lowest_versions() if name == "lowest" else []
     python, empty = folder / name / "bin" / "python", folder / f"{name}_empty"
     shutil.rmtree(folder / name, ignore_errors=True)
@@ -88,15 +124,16 @@ def try_column(name: str, folder: Path, tests: bool) -> dict[str, Any]:
         "smoke run": (python.with_name("mjx-revolve"), "evolve", "smoke", "--out", "run"),
     }
     if tests:
-        quick = ("--numprocesses", "2", "--dist", "loadfile", "-m", "not slow")
+        pytest = (python, "-m", "pytest", "--numprocesses", "2", "--dist", "loadfile")
         steps["test tools"] = (*pip, *pins, *TOOLS)
-        steps["quick tests"] = (python, "-m", "pytest", *quick)
+        steps["quick tests" if tested is QUICK else "doors and examples"] = (*pytest, *tested)
     found: dict[str, Any] = {}
     for step, command in steps.items():
         here = empty if step in ("imports", "smoke run") else ROOT
         well, said = run(*command, folder=here)
-        found[step] = "passed" if well else f"failed: {said}"
-        print(f"{name}: {step}: {found[step] if step != 'quick tests' else said}", flush=True)
+        counts = re.search(r"\d+ passed.*(?= in )", said)
+        found[step] = (counts[0] if counts else "passed") if well else f"failed: {said}"
+        print(f"{name}: {step}: {found[step]}", flush=True)
         if not well:
             break
         if step == "install":
@@ -104,6 +141,13 @@ def try_column(name: str, folder: Path, tests: bool) -> dict[str, Any]:
             print(f"{name}: {found['distributions']} distributions, {found['megabytes']} MB")
     shutil.rmtree(folder / name)
     return found
+
+
+def describe(name: str, found: dict[str, Any]) -> str:
+    """What was found in an environment, in a line: versions, then what each step said."""
+    versions = found.get("versions", {})
+    named = ", ".join(f"{one} {versions[one]}" for one in COLUMNS[name][2] if one in versions)
+    return f"{named}: " + "; ".join(f"{step} {found[step]}" for step in STEPS if step in found)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -122,11 +166,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"Wrote {path}")
     if args.results:
         columns = [
-            {"name": name, "distributions": one.get("distributions"),
-             "megabytes": one.get("megabytes"), "steps": one,
-             "found": "; ".join(f"{step} {said}" for step, said in one.items() if step in STEPS)}
-            for name, one in found.items()
-        ]  # fmt: skip
+            {"name": name, **one, "found": describe(name, one)} for name, one in found.items()
+        ]
         write_results("installations", {"columns": columns}, ())
     return int(any("failed" in str(step) for one in found.values() for step in one.values()))
 

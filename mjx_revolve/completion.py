@@ -1,6 +1,6 @@
 """Command line: a script by which a shell completes commands, and names of what is shipped.
 
-``eval "$(mjx-revolve completion bash)"`` in `~/.bashrc`; for zsh, in `~/.zshrc` behind `compinit`.
+``eval "$(mjx-revolve completion bash)"`` in `~/.bashrc`, the same with `zsh` in `~/.zshrc`.
 The names are those of the package as it was when the script was printed.
 """
 
@@ -27,7 +27,9 @@ _SCRIPT = """_mjx_revolve() {
 }
 complete -o default -F _mjx_revolve mjx-revolve
 """
-_ZSH = "autoload -U +X bashcompinit && bashcompinit\n"
+_ZSH = """(( $+functions[compdef] )) || { autoload -Uz compinit && compinit; }
+autoload -U +X bashcompinit && bashcompinit
+"""
 
 
 def make_script(shell: str) -> str:
@@ -59,7 +61,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = Parser(
         prog=program("completion"),
         description="Print a script by which a shell completes commands and shipped names.",
-        epilog='example: eval "$(mjx-revolve completion bash)" in ~/.bashrc',
+        epilog='example: eval "$(mjx-revolve completion bash)" in ~/.bashrc, or zsh in ~/.zshrc',
     )
     parser.add_argument("shell", choices=("bash", "zsh"), help="the shell of the script")
     print(make_script(parser.parse_args(argv).shell), end="")

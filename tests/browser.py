@@ -26,7 +26,10 @@ _FLAGS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--disable-dev-shm-usage",
-    "--disable-background-networking",
+    "--disable-background-networking",  # it asks for the pages that tests open, and for no others
+    "--disable-component-update",
+    "--disable-quic",
+    "--disable-sync",
     "--no-first-run",
     "--hide-scrollbars",
     "--remote-debugging-pipe",

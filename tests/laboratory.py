@@ -45,6 +45,11 @@ WILD = sorted((ROOT.parent / "shared" / "revolve_robots").glob("*.yaml"))
 WATER = {"gravity": 9.81, "buoyancy": "partial", "drag": "faces", "added_mass": True}
 
 
+def need_mjx() -> None:
+    """Skips what follows in a test where MJX is not installed."""
+    pytest.importorskip("mujoco.mjx", reason="the extra [mjx] is not installed")
+
+
 def body(name: str) -> Morphology:
     """One of the shipped robots."""
     return load_morphology(ROOT / "morphologies" / f"{name}.yaml")

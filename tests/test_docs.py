@@ -20,7 +20,8 @@ from urllib.parse import unquote
 import pytest
 
 import mjx_revolve
-from laboratory import ROOT
+from browser import Browser, needs_browser
+from laboratory import ROOT, need_mjx
 from mjx_revolve.inputs.packages import REQUIREMENTS
 
 FOUND = [m.name for m in pkgutil.walk_packages(mjx_revolve.__path__, "mjx_revolve.")]
@@ -29,6 +30,8 @@ MODULES = [name for name in FOUND if "._" not in name]
 
 @pytest.mark.parametrize("name", MODULES)
 def test_every_public_name_has_a_docstring(name):
+    if name.endswith("mjx_engine"):
+        need_mjx()
     module = importlib.import_module(name)
     assert (module.__doc__ or "").strip()
     for key, value in vars(module).items():
@@ -398,6 +401,16 @@ def test_every_link_leads_somewhere(site):
     assert '<a href="physics.html"><code>docs/physics.md</code></a>' in (
         (site / "index.html").read_text()
     )
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_page_of_the_gallery_moves_without_an_error(site):
+    with Browser() as browser:
+        browser.open(site / "gallery" / "core.html", "#plain")
+        browser.wait("document.documentElement.dataset.time > 0.3")
+        assert browser.fact("error") is None and browser.errors == []
+        assert all(address.startswith("file:") for address in browser.requests)
 
 
 def test_messages_name_what_can_be_installed():

@@ -2,14 +2,17 @@
 
 import json
 import re
+import shutil
+import subprocess
 
-import jsonschema
 import pytest
 
 from laboratory import ROOT
 from mjx_revolve.completion import make_script
 from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.schema import FOLDER, KINDS, make_schema, show_schema
+
+jsonschema = pytest.importorskip("jsonschema", reason="it checks files against schemas")
 
 FILES = [
     *(ROOT / "configs").glob("*.yaml"),
@@ -65,3 +68,15 @@ def test_completion_has_the_shipped_names():
     script = make_script("bash")
     assert "lake_swim" in script and "spider" in script and "schema completion" in script
     assert make_script("zsh").endswith(script)
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_completion_loads_in_a_shell_of_no_settings(shell):
+    if shutil.which(shell) is None:
+        pytest.skip(f"no {shell} on the path")
+    plain = {"bash": "--norc", "zsh": "-f"}[shell]
+    done = subprocess.run(
+        [shell, plain, "-c", f"{make_script(shell)}\ncomplete -p mjx-revolve"],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0 and "_mjx_revolve" in done.stdout and not done.stderr

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.random_bodies import random_body
-from laboratory import body, random_states, read, world
+from laboratory import body, need_mjx, random_states, read, world
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.kinematics import body_poses, mass_centers
 from mjx_revolve.engine.plant import body_geometry
@@ -28,6 +28,8 @@ def mujocos(robot, qpos):
 @pytest.mark.parametrize("engine", ["population", "mjx"])
 def test_the_centre_of_mass_is_mujocos(engine):
     """In any pose, far from the origin, and without the water that is carried along."""
+    if engine == "mjx":
+        need_mjx()
     with jax.enable_x64(True):
         robot = build_robot(random_body(4, 5, 9), world(**WATER))
         qpos, qvel = random_states(robot, 4)

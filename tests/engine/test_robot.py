@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import OURS, WILD, body, face_drag, read, world
+from laboratory import OURS, WILD, body, face_drag, need_mjx, read, world
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.engine.batch import fit_capacity
 from mjx_revolve.engine.engines import make_engine
@@ -227,9 +227,10 @@ def test_an_edited_model_is_a_new_robot(kind):
     assert np.allclose(after.gain, before.gain)
     doubled = 2 if kind == "model" else 1
     assert other.assembly.mass[5] == pytest.approx(doubled * robot.assembly.mass[5])
-    assert make_engine(other, "mjx").robot.mj_model.dof_damping[9] == 0.5
     again = pickle.loads(pickle.dumps(other))
     assert again.mj_model.dof_damping[9] == 0.5
+    need_mjx()
+    assert make_engine(other, "mjx").robot.mj_model.dof_damping[9] == 0.5
 
 
 def test_what_an_edited_model_may_not_change():

@@ -13,7 +13,7 @@ import pytest
 from experiments.random_bodies import random_body
 from experiments.self_contact import make_march, random_gaits
 from experiments.water_tank import EMPTY, march
-from laboratory import QUICK, at_rest, body, limp
+from laboratory import QUICK, at_rest, body, limp, need_mjx
 from mjx_revolve import load_world
 from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
@@ -347,6 +347,7 @@ def test_random_bodies_under_fast_random_gaits_hardly_overlap(timestep):
 
 def test_mjx_refuses_modules_that_can_meet():
     """And says which; a body whose modules cannot meet swims in both engines."""
+    need_mjx()
     words = "self_contact: expected false with engine: mjx.* modules '(.*)' and '(.*)' can meet"
     with pytest.raises(InputError, match=words) as found:
         make_engine(jaw(), "mjx")

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import OAR, swimmer
+from laboratory import OAR, need_mjx, swimmer
 from mjx_revolve import InputError, make_fitness
 from mjx_revolve.episodes.scoring import WORST
 from mjx_revolve.episodes.windows import make_windows
@@ -158,5 +158,6 @@ def test_what_is_refused(settings):
         windows.init(np.zeros((1, 3)), KEY)
     with pytest.raises(InputError, match=r"^key: expected jax\.random\.key"):
         windows.init(np.zeros((1, 4)), 3)
+    need_mjx()
     with pytest.raises(InputError, match="engine: expected population, to go back"):
         make_windows(make_fitness(settings, engine="mjx"))

@@ -5,7 +5,6 @@ import math
 from dataclasses import replace
 from functools import lru_cache
 
-import av
 import mujoco
 import numpy as np
 import pytest
@@ -243,17 +242,22 @@ def moving_dot(count=30, size=SIZE):
         yield frame
 
 
-def read_mp4(path):
+@pytest.fixture
+def av():
+    return pytest.importorskip("av", reason="the extra [film] writes MP4")
+
+
+def read_mp4(av, path):
     with av.open(str(path)) as file:
         stream = file.streams.video[0]
         pictures = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
         return stream, float(stream.average_rate), stream.codec_context, pictures
 
 
-def test_mp4_reads_back(tmp_path):
+def test_mp4_reads_back(av, tmp_path):
     path = tmp_path / "dot.mp4"
     write_mp4(path, moving_dot(), SIZE, 25, "a dot")
-    _, rate, codec, pictures = read_mp4(path)
+    _, rate, codec, pictures = read_mp4(av, path)
     assert len(pictures) == 30 and rate == 25
     assert codec.name == "h264" and codec.pix_fmt == "yuv420p"
     for picture, frame in zip(pictures, moving_dot(), strict=True):
@@ -353,7 +357,7 @@ def test_the_dead_are_not_drawn(colony, way):
 
 
 @pytest.mark.slow
-def test_the_command_films_a_colony(colony, way, tmp_path, monkeypatch, capsys):
+def test_the_command_films_a_colony(av, colony, way, tmp_path, monkeypatch, capsys):
     asked = []
     monkeypatch.setattr(
         "mjx_revolve.view.colony.record_colony", lambda *given: asked.append(given) or colony
@@ -394,11 +398,11 @@ def command(episode, monkeypatch):
 
 
 @pytest.mark.slow
-def test_command_writes_film_gif_and_page(command, way, tmp_path, capsys):
+def test_command_writes_film_gif_and_page(av, command, way, tmp_path, capsys):
     (tmp_path / "config.yaml").write_text("")
     small = ("--size", f"{SIZE[0]}x{SIZE[1]}", "--fps", "10")
     assert command(str(tmp_path), *small) == 0
-    _, rate, _, pictures = read_mp4(tmp_path / "swim.mp4")
+    _, rate, _, pictures = read_mp4(av, tmp_path / "swim.mp4")
     assert len(pictures) == 10 and rate == 10 and pictures[0].shape == (120, 160, 3)
     assert pictures[0].std() > 10
     with Image.open(tmp_path / "swim.gif") as gif:
