@@ -588,39 +588,32 @@ def implicit_share(world: World, level: Level, motion: BodyMotion, dt: float) ->
     min(1, z²) with z = dt G / m, where G = Σ g ρ A v bounds the gradient of the drag: over the
     parts, with the largest face A, the speed v of the fastest corner, and the law's `steepest` g.
     An extrapolated force is stable for gradients up to m / (dt (1 - z²)), which is 2.6 G or more.
-    1 with MuJoCo's laws, which are explicit as in MuJoCo.
+    1 in motion without such a bound, and with MuJoCo's laws, which are explicit as in MuJoCo.
     """
     w, gradient, mass = motion.angular_velocity, 0.0, add(level.mass, 1e-12)
     for parts in level.parts:
-        law = find_drag_law(parts.laws.drag)
-        if law.explicit or law.steepest is None:
-            return 1.0
-        area, reach = _face_and_reach(parts.half_size)
-        speed = safe_norm(vadd(motion.velocity, cross(w, parts.position)))
-        speed = add(speed, mul(reach, safe_norm(w)))
-        steep = mul(law.steepest * world.density, mul(area, speed))
-        gradient = add(gradient, sum_parts(steep, parts.count))
+        if not is_present(parts.steep):
+            continue
+        corner = mul(_length(parts.half_size), safe_norm(w))
+        speed = add(safe_norm(vadd(motion.velocity, cross(w, parts.position))), corner)
+        gradient = add(gradient, sum_parts(mul(parts.steep, speed), parts.count))
         if parts.carried is not None:
             x, y, z = parts.carried.mass
-            xp = _functions_for(x, y, z)
-            mass = add(mass, sum_parts(xp.minimum(xp.minimum(x, y), z), parts.count))
+            mass = add(mass, sum_parts(_least(_least(x, y), z), parts.count))
     if isinstance(gradient, float):
         return 0.0
     ratio = dt * gradient / mass
     return jnp.minimum(ratio * ratio, 1)
 
 
-def _face_and_reach(half_size: Vec) -> tuple[Scalar, Scalar]:
-    """The largest face of a box [m²], and from its centre to a corner [m]."""
-    x, y, z = half_size
-    xp = _functions_for(x, y, z)
-    area = xp.maximum(xp.maximum(mul(x, y), mul(y, z)), mul(z, x))
-    return mul(4.0, area), xp.sqrt(dot(half_size, half_size))
+def _length(a: Vec) -> Scalar:
+    square = dot(a, a)
+    return jnp.sqrt(square) if isinstance(square, jax.Array) else np.sqrt(square)
 
 
-def _functions_for(*numbers: Scalar) -> Any:
-    """JAX's functions where a number is traced; else NumPy's, so that constants fold."""
-    return jnp if any(isinstance(x, jax.Array) for x in numbers) else np
+def _least(a: Scalar, b: Scalar) -> Scalar:
+    traced = isinstance(a, jax.Array) or isinstance(b, jax.Array)
+    return jnp.minimum(a, b) if traced else np.minimum(a, b)
 
 
 def water_forces(

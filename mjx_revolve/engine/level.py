@@ -29,6 +29,7 @@ from mjx_revolve.water.laws import PartDragLaw, law_numbers, part_field
 _SHAPE = "the robot's shape, which is known"
 _MEASURED = "thrusters keep their curves, which are measured"
 _INSIDE = "its own fields say"
+_BOUND = "a bound, with a margin"
 
 
 class PartLaws(NamedTuple):
@@ -152,6 +153,8 @@ class Parts:
         half_size: half edges of the box [m].
         center_position: centre of the displaced volume [m].
         volume: displaced [m³].
+        steep: bound of the drag's gradient over the speed [kg/m]; next to endless without a bound
+            and with explicit laws.
         bulk: volume of the box [m³], for drag laws of whole bodies.
         exposed: share of each pair of faces that the water reaches [-], for surface tension.
         drag: numbers of their drag law; in `StepConstants`, those of all laws by name.
@@ -166,6 +169,7 @@ class Parts:
     half_size: Vec = part_field("m", axes="size", blank=1.0, fixed=_SHAPE)
     center_position: Vec = part_field("m", fixed=_SHAPE)
     volume: Scalar = part_field("m3", varied=("density",))
+    steep: Scalar = part_field("kg/m", fixed=_BOUND)
     bulk: Any = part_field("m3", fixed=_SHAPE, default=None)
     exposed: Any = part_field("-", axes="size", fixed=_SHAPE, default=None)
     drag: Any = part_field("-", fixed=_INSIDE, default=None)

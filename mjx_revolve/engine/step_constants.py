@@ -7,13 +7,14 @@ with a column without effect, which pads rows and levels.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from mjx_revolve.body.placement import counted, turned
 from mjx_revolve.engine.assembly import Assembly
@@ -36,6 +37,7 @@ from mjx_revolve.water.buoyancy import find_buoyancy_law
 from mjx_revolve.water.drag import find_drag_law
 from mjx_revolve.water.laws import (
     BodyDragLaw,
+    DragLaw,
     PartDragLaw,
     PartField,
     map_fields,
@@ -309,6 +311,20 @@ def _principal(assembly: Assembly) -> tuple[np.ndarray, np.ndarray]:
     return moments, axes
 
 
+# Steeper than any step can take explicitly, and its square is a float32; a choice.
+_UNBOUNDED = 1e9
+
+
+def _steepness(
+    table: FluidTable, laws: Mapping[str, DragLaw], density: float
+) -> Float[np.ndarray, " npart"]:
+    """How steep each part's drag is at most, see `Parts.steep`: g ρ A with the largest face A."""
+    bounds = {name: None if law.explicit else law.steepest for name, law in laws.items()}
+    bound = np.array([_UNBOUNDED if bounds[name] is None else bounds[name] for name in table.drag])
+    x, y, z = table.half_size.T
+    return bound * density * 4 * np.max([x * y, y * z, z * x], 0)
+
+
 def _read_parts(assembly: Assembly, frame: np.ndarray) -> Parts:
     """All parts, with the numbers of every law that any of them obeys."""
     table, world = assembly.fluid, assembly.world
@@ -326,6 +342,7 @@ def _read_parts(assembly: Assembly, frame: np.ndarray) -> Parts:
         half_size=table.half_size,
         center_position=position + turned(turn, table.center_of_volume),
         volume=table.volume,
+        steep=_steepness(table, laws, world.density),
         bulk=8 * table.half_size.prod(-1) if whole else None,
         exposed=table.exposed if world.surface_tension else None,
         drag={
