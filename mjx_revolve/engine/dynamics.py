@@ -346,7 +346,7 @@ def midpoint_forces(
     """
     if not motion.midpoint or not dt:
         return water_forces(world, level, motion, gravity, water, thrusts, before)
-    share = implicit_share(world, level, motion, dt)
+    share = implicit_share(world, level, motion, water, dt)
     angular, linear = (
         vadd(v, vscale(sub(1, share), vsub(middle, v)))
         for v, middle in zip(

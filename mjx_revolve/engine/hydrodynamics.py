@@ -582,11 +582,14 @@ def _body_drag(
     return vadd(torque, cross(box.position, force)), force
 
 
-def implicit_share(world: World, level: Level, motion: BodyMotion, dt: float) -> Scalar:
+def implicit_share(
+    world: World, level: Level, motion: BodyMotion, water: Water, dt: float
+) -> Scalar:
     """Which share of the drag a step takes implicitly, `[nbody, lanes]` in 0 to 1 [-].
 
     min(1, z²) with z = dt G / m, where G = Σ g ρ A v bounds the gradient of the drag: over the
-    parts, with the largest face A, the speed v of the fastest corner, and the law's `steepest` g.
+    parts, with the largest face A, the speed v of the fastest corner through the water, and the
+    law's `steepest` g.
     An extrapolated force is stable for gradients up to m / (dt (1 - z²)), which is 2.6 G or more.
     1 in motion without such a bound, and with MuJoCo's laws, which are explicit as in MuJoCo.
     """
@@ -595,7 +598,10 @@ def implicit_share(world: World, level: Level, motion: BodyMotion, dt: float) ->
         if not is_present(parts.steep):
             continue
         corner = mul(_length(parts.half_size), safe_norm(w))
-        speed = add(safe_norm(vadd(motion.velocity, cross(w, parts.position))), corner)
+        velocity = vadd(motion.velocity, cross(w, parts.position))
+        stream = _stream(world, water, motion, parts.position).velocity
+        speed = safe_norm(velocity if stream is None else vsub(velocity, stream))
+        speed = add(speed, corner)
         gradient = add(gradient, sum_parts(mul(parts.steep, speed), parts.count))
         if parts.carried is not None:
             x, y, z = parts.carried.mass
