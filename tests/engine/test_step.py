@@ -112,6 +112,23 @@ def gusty(tank, seed, seconds):
 
 
 @pytest.mark.slow
+def test_a_stroke_in_the_default_water_is_of_second_order():
+    """Where a snake that beats smoothly is after 2 s, against steps of 0.6 ms."""
+    ends = []
+    for dt in (0.01, 0.005, 0.000625):
+        tank = world(drag="cross_flow", added_mass=True, timestep=dt)
+        robot = build_robot(trim_neutral(body("snake"), RHO), tank)
+        steps = dt * np.arange(round(2.0 / dt))
+        target = 0.3 * np.sin(2 * np.pi * steps) * np.minimum(steps, 1)
+        lag = np.arange(robot.num_hinges)
+        ctrl = (target[:, None] * np.cos(lag))[:, :, None]
+        _, q, _, _ = march(robot, 2.0, *at_rest(robot, 1, -5.0), ctrl)
+        ends.append(q[-1, :3, 0])
+    way = np.linalg.norm(ends[-1] - [0, 0, -5])
+    errors = [np.linalg.norm(end - ends[-1]) / way for end in ends[:2]]
+    assert errors[1] < 0.012 and errors[0] > 3 * errors[1]
+
+
 def test_a_neutral_body_goes_with_the_water_whatever_its_shape():
     """Without drag; pressure and carried water move it as they would the water in its place."""
     gust = {"std": [0.2, 0.1, 0.1], "time": 0.5}
