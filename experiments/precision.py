@@ -98,7 +98,7 @@ CASES = (
         "AUV, default water, gusts, thrusters with lag", "auv",
         {"world.gust": {"std": [0.05] * 3, "time": 5.0}, "task.trials": 1,
          "controller": {"type": "feedback", "gain": 0.5, "between": "ramp"}},
-        "auv_hold_depth", spread=0.05,
+        "configs/auv_hold_depth", spread=0.05,
     ),
     Case(f"{_BODIES} bodies, default water, gusts", "", {"world": _LAKE, "trim": "none"}),
     Case(
