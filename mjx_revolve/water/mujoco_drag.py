@@ -218,7 +218,6 @@ INERTIA_BOX = BodyDragLaw(
     summary="MuJoCo's law for a body as one box of equal inertia",
     explicit=True,
     varied=False,
-    steepest=1.0,  # C_d of 1
     body_force=inertia_box,
     mjcf=Export("inertia_box", note="drag is MuJoCo's inertia-box law, as it evolved with"),
     sdf=Export("faces", FACES.sdf.note, missing=f"drag: inertia_box, {_INSTEAD}"),
@@ -228,7 +227,6 @@ ELLIPSOID = PartDragLaw(
     summary="MuJoCo's law for an ellipsoid, with lift",
     explicit=True,
     varied=False,
-    steepest=1.0,  # C_d of 1
     numbers=_numbers_of_ellipsoids,
     force=_ellipsoid_drag,
     mj_fluidcoef=ELLIPSOID_COEFFICIENTS,
