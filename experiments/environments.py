@@ -54,7 +54,13 @@ ENVIRONMENTS: dict[str, Case] = {
     ),
     "bed": Case(
         "on the lake's bed; bodies are not trimmed, so they sink",
-        ("world=lake", "trim=none", "task.type=crawl", "task.start_attitude=level"),
+        (
+            "world=lake",
+            "trim=none",
+            "task.type=crawl",
+            "task.start_attitude=level",
+            "task.horizon=null",
+        ),
     ),
     "current": Case(
         f"2 m below the lake's surface in a current of {CURRENT:g} m/s; progress against it counts",
@@ -77,7 +83,8 @@ def through_water(case: str, figures: Figures) -> Figures:
     Returns:
         `water_speed_bl_s` [body lengths/s].
     """
-    taken = CURRENT / figures["length"] if case == "current" else 0.0
+    moved = case == "current" and figures["speed_m_s"] > 0
+    taken = CURRENT * figures["speed_bl_s"] / figures["speed_m_s"] if moved else 0.0
     return {"water_speed_bl_s": figures["score"] + taken}
 
 

@@ -82,7 +82,7 @@ def test_a_study_runs_what_is_left_and_reports_it(tmp_path, started, monkeypatch
     count = len(started)
     for options, message in (
         (("--generations", "2"), "expected a run of 2 generations at most; found 3"),
-        (("--generations", "3", "--set", "task.duration=7"), "task.duration: expected 6"),
+        (("--generations", "3", "--set", "task.duration=7"), "task.duration: expected 12"),
     ):
         with pytest.raises(InputError, match=message):
             study(tmp_path, *two, *options)
@@ -122,7 +122,7 @@ def test_environments_are_what_they_are_called():
     assert (plans["bed"].trim, plans["bed"].task.type) == ("none", "crawl")
     against = np.dot(plans["current"].world["current"], plans["current"].task.direction)
     assert against == pytest.approx(-environments.CURRENT)
-    figures = {"score": 0.1, "length": 0.5}
+    figures = {"score": 0.1, "speed_bl_s": 0.12, "speed_m_s": 0.06}
     assert environments.through_water("current", figures)["water_speed_bl_s"] == pytest.approx(0.2)
     assert environments.through_water("shore", figures)["water_speed_bl_s"] == 0.1
 
@@ -135,7 +135,7 @@ def test_budgets_are_equal(settings):
         for name, case in cases.items()
     }
     trials = budgets.count_trials(configs["coevolution"])
-    assert trials == (24 + 6 * 16 if settings else 24 + 15 * 16) * 2 * 64
+    assert trials == (24 + 6 * 16 if settings else 24 + 11 * 16) * 2 * 48
     assert budgets.count_trials(configs["random_search"]) == trials
     for robot in budgets.ROBOTS:
         assert configs[robot].bodies is None
