@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.common import ROOT, make_folder, make_parser, write_results
+from experiments.common import RESULTS, ROOT, make_folder, make_parser, write_results
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
@@ -165,9 +165,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     write_atomic(path, (json.dumps(found, indent=1) + "\n").encode())
     print(f"Wrote {path}")
     if args.results:
-        columns = [
-            {"name": name, **one, "found": describe(name, one)} for name, one in found.items()
-        ]
+        # Columns that were not tried stay as they were found.
+        place = RESULTS / "installations.json"
+        older = json.loads(place.read_text("utf-8"))["numbers"]["columns"] if place.exists() else []
+        known = {one["name"]: one for one in older} | {
+            name: {"name": name, **one, "found": describe(name, one)} for name, one in found.items()
+        }
+        columns = [known[name] for name in COLUMNS if name in known]
         write_results("installations", {"columns": columns}, ())
     return int(any("failed" in str(step) for one in found.values() for step in one.values()))
 
