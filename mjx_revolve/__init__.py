@@ -14,7 +14,7 @@ watch_imports()  # before anything that takes time to import
 
 import lazy_loader  # noqa: E402
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __all__ += ["__version__"]
