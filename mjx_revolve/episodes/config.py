@@ -417,7 +417,9 @@ class Config(Settings):
         """Refuses settings that a colony does not use."""
         if self.bodies is None:
             raise ConstraintError("bodies", "how bodies evolve, as there is a colony", "nothing")
-        for name, usual in (("learning", LearningConfig()), ("selection", SelectionConfig())):
+        # How robots are chosen is the colony's; whether a champion needs a passport is not.
+        selection = SelectionConfig(passport=self.bodies.selection.passport)
+        for name, usual in (("learning", LearningConfig()), ("selection", selection)):
             if getattr(self.bodies, name) != usual:
                 what = "nothing, as in a colony robots that meet have children, and learn nothing"
                 raise ConstraintError(f"bodies.{name}", what, "some settings")
