@@ -35,7 +35,7 @@ from mjx_revolve.water.plates import LiftDrag
 from mjx_revolve.water.world import load_world
 
 RHO, G = 999.1026, 9.81
-# A champion of experiments/sine_swim.yaml, seed 0, rounded: a spider that swims.
+# A champion of experiments/sine_swim.yaml of an earlier step, seed 0, rounded: a spider that swims.
 SWIMMER = (
     -1.46, -1.66, -1.34, -2.52, -0.12, 0.37, 0.09, -1.03, 0.96, 0.97, 0.89, -0.37, 1.96, -2.55,
     -1.4, -1.13, -2.91, 0.19, -0.18, 0.16, -0.24, -1.98, -0.17, -0.75, -1.62, -0.46, -0.19,
