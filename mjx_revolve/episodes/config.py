@@ -345,8 +345,10 @@ class EvolutionConfig(Settings):
     """Number of newest checkpoints that are kept."""
     tensorboard: bool = False
     """Whether the metrics go to RUN/tensorboard/ as well; needs tensorboardX."""
-    passport: bool = True
-    """Whether the champion's passport is made at the end, in half a minute or a whole one."""
+    passport: Literal["required"] | bool = True
+    """Whether the champion's passport is made at the end, in half a minute or a whole one.
+    `required`: of the few best candidates, the first that passes becomes the champion, or the best
+    where none does; where bodies evolve, `bodies.selection.passport` asks for that."""
     strategy_params: dict[str, Any] = Field({})
     """Settings of the strategy itself, by evosax's names."""
 
@@ -406,6 +408,9 @@ class Config(Settings):
             raise ConstraintError("controller.type", what, "brain")
         if self.engine != "population":
             raise ConstraintError("engine", "population, as bodies evolve", self.engine)
+        if self.evolution.passport == "required":
+            what = "true or false, as bodies evolve (bodies.selection.passport asks for it)"
+            raise ConstraintError("evolution.passport", what, "required")
         for name in ("strategy", "strategy_params"):
             usual, found = EvolutionConfig.model_fields[name].default, getattr(self.evolution, name)
             if found != usual:

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from mjx_revolve.episodes.config import EvolutionConfig
+from mjx_revolve.episodes.passport import Passport, make_passport
 from mjx_revolve.evolution.executor import Executor
 from mjx_revolve.evolution.generations import (
     Champion,
@@ -189,7 +190,8 @@ class GeneEvolution:
         """The best of the elites, the last best, the last mean and zero genes on fresh starts.
 
         Every search starts at zero genes, a robot that does not move: the champion of a search
-        misled by noise is at least no worse than that.
+        misled by noise is at least no worse than that. Where a passport is required, the first of
+        the best few that passes.
         """
         candidates = [*search.elites, search.latest]
         origins = [f"best of generation {g}" for g in search.elite_generations]
@@ -215,7 +217,13 @@ class GeneEvolution:
             n = len(indices)
             return scores[:n], {name: values[:n] for name, values in measures.items()}
 
-        winner, found = choose_candidate(score, eligible, self.config.seed)
+        def judge(k: int) -> Passport:
+            return make_passport(self.executor.fitness, genes[k], self.config.seed)
+
+        required = self.config.passport == "required"
+        winner, found = choose_candidate(
+            score, eligible, self.config.seed, judge if required else None
+        )
         return Champion(genes=genes[winner], origin=origins[winner], **found)
 
     # --- to and from a checkpoint

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from mjx_revolve.episodes.config import EvolutionConfig
+from mjx_revolve.episodes.passport import Check, Passport
+from mjx_revolve.evolution import gene_search
 from mjx_revolve.evolution.executor import Executor
 from mjx_revolve.evolution.gene_search import GeneEvolution
 from mjx_revolve.evolution.generations import run_generations
@@ -245,3 +247,18 @@ def test_doing_nothing_is_a_candidate():
     # Of equal ones, what has evolved wins.
     champion = choose_champion(config, Broken(lambda rows: rows >= 0, 1.0), search)
     assert champion.origin.startswith("best of generation")
+
+
+def test_where_a_passport_is_required_the_first_that_passes_becomes_the_champion(monkeypatch):
+    config, fitness = settings(generations=30), Quadratic()
+    search, _ = finish(config, fitness)
+    best = choose_champion(config, fitness, search)
+
+    def judged(fitness, genes, seed):
+        right = not np.array_equal(genes, best.genes)
+        return Passport({"kept": Check("kept", float(right), least=0.5)})
+
+    monkeypatch.setattr(gene_search, "make_passport", judged)
+    second = choose_champion(settings(generations=30, passport="required"), fitness, search)
+    assert not np.array_equal(second.genes, best.genes) and not second.passport.failed
+    assert second.score <= best.score and best.passport is None
