@@ -154,7 +154,7 @@ def _finish(run: FitRun, interrupts: Interrupts) -> int:
     problem = run.problem
     print(plain(
         f"{problem.robot.morphology.name}: {', '.join(run.request.free)} | "
-        f"{len(problem.recordings)} recordings, {int(problem.drive.resets.sum())} windows of "
+        f"recordings: {len(problem.recordings)}, {int(problem.drive.resets.sum())} windows of "
         f"{problem.window:.3g} s | {place}"
     ), flush=True)  # fmt: skip
     interrupts.finish_first("finishing the step that is under way")
@@ -179,7 +179,7 @@ def describe(fit: Fit) -> list[str]:
     lines = []
     for v in fit.values:
         unit = v.unit or "times what it was"
-        ends = f"[{v.low:.4g}, {v.high:.4g}]" if v.found else "not found by itself"
+        ends = f"[{v.low:.4g}, {v.high:.4g}]" if v.found else "(not found by itself)"
         lines.append(f"{v.name}: {v.value:.4g} {unit} {ends}")
     lines += [f"{r}: {n} {x:.3g} ± {s:.2g}" for r, n, x, s in fit.local]
     lines += [f"{u.words}: the recordings do not determine more" for u in fit.unknown]

@@ -137,19 +137,22 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
         if key.startswith("mark.") and key.count(".") == 1
     }
     rest = {k: v for k, v in columns.items() if not (k.startswith("mark.") and k.count(".") == 1)}
+    unused: list[str] = []
     with reading(path):
         if path.is_dir() and (path / "run.json").is_file():
             signals = _read_run(path)
         elif path.is_dir() or path.suffix in (".mcap", ".db3"):
             signals = _read_bag(path, rest)
         else:
-            signals = _read_csv(path, rest, robot)
+            signals, unused = _read_csv(path, rest, robot)
         signals, marks = _name_marks(signals, marks, robot)
         signals, notes = _check_signals(signals, robot)
     uncommanded = [m.name for m in robot.morphology.modules if m.kind.hinge or m.kind.is_thruster]
     uncommanded = [n for n in uncommanded if not {f"command.{n}", f"angle.{n}"} & set(signals)]
     if uncommanded:
         notes.append(f"no commands of {', '.join(uncommanded)}: taken to be 0")
+    if unused:
+        notes.append(f"columns of no known name, not read: {', '.join(unused)} (--map NAME=COLUMN)")
     return RobotRecording(path.stem, signals, marks, tuple(notes))
 
 
@@ -171,7 +174,10 @@ def _read_mark(key: str, source: str, robot: Robot) -> MarkedPoint:
 # --- CSV ------------------------------------------------------------------------------------------
 
 
-def _read_csv(path: Path, columns: Mapping[str, str], robot: Robot) -> dict[str, TimeSeries]:
+def _read_csv(
+    path: Path, columns: Mapping[str, str], robot: Robot
+) -> tuple[dict[str, TimeSeries], list[str]]:
+    """Signals by name, and the columns that are none."""
     text = read_file(path).decode("utf-8-sig")
     rows = list(csv.reader(io.StringIO(text)))
     rows = [row for row in rows if any(cell.strip() for cell in row)]
@@ -200,6 +206,8 @@ def _read_csv(path: Path, columns: Mapping[str, str], robot: Robot) -> dict[str,
             f"expected a column time (--map time=COLUMN, or frame*0.0333); found "
             f"{', '.join(header)}"
         )
+    read = {k for k, _ in named.values()}
+    unused = [name for k, name in enumerate(header) if k not in read]
     column, scale = named.pop("time")
     time = scale * values[:, column]
     if not np.isfinite(time).all():
@@ -220,7 +228,7 @@ def _read_csv(path: Path, columns: Mapping[str, str], robot: Robot) -> dict[str,
         if not known.any():
             raise InputError(f"column {header[k]}: expected numbers; found none, or NaN only")
         found[name] = TimeSeries(time[known], value[known])
-    return found
+    return found, unused
 
 
 def _name_columns(

@@ -1,7 +1,7 @@
 """Compiles element-wise steps of a population into few fast loops on XLA:CPU.
 
-Two internal annotations of XLA do it (jaxlib is pinned for their sake; `tests/numerics/test_xla.py`
-notices if they lose their effect). Results do not depend on them, but for the last bits.
+Two internal annotations of XLA do it (`tests/numerics/test_xla.py` notices if a jaxlib no longer
+heeds them). Results do not depend on them, but for the last bits.
 
 1. XLA:CPU recomputes a shared value inside every fusion that uses it, and a tree recursion is
    nothing but shared values: the work multiplies with depth. An optimization barrier does not help,
@@ -23,6 +23,7 @@ distinguished from one in this package.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
 from collections.abc import Callable
@@ -94,9 +95,20 @@ def compiler_options(fast: bool = False) -> dict[str, Any] | None:
     """
     if not on_cpu():
         return None
+    wanted: dict[str, Any] = {"xla_cpu_prefer_vector_width": 512}
     if fast:
-        return {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-    return {"xla_cpu_prefer_vector_width": 512}
+        wanted = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+    return {name: value for name, value in wanted.items() if _is_known(name, value)}
+
+
+@functools.cache
+def _is_known(name: str, value: int) -> bool:
+    """Whether this jaxlib has an option: they are XLA's own, and come and go."""
+    try:
+        jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 def jit(fun: Callable[..., PyTree], fast: bool = False, **settings: Any) -> Any:

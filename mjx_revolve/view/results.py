@@ -27,7 +27,7 @@ def describe_score(champion: Champion, config: Config) -> str:
     """The result of a run: `0.158 ± 0.0025 body lengths/s, mean ± SD over 16 fresh starts`."""
     unit = score_unit(config.task.type, config.task.unit)
     score = f"{champion.score:.3g} ± {champion.std:.2g} {unit}".rstrip()
-    mark = champion.passport.mark if champion.passport is not None else ""
+    mark = (champion.passport.mark or "passes its passport") if champion.passport else ""
     return f"{score}, mean ± SD over {REPORT_EPISODES} fresh starts" + (f"; {mark}" if mark else "")
 
 

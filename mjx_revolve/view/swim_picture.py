@@ -131,7 +131,7 @@ def _facts(motion: Motion) -> str:
     begun = motion.time[motion.first]
     when = f"from {begun:.3g} s on" if motion.first else "getting under way included"
     return (
-        f"{motion.distance:.2g} m ({motion.distance / motion.length:.2g} body lengths) in "
+        f"one episode: {motion.distance:.2g} m ({motion.distance / motion.length:.2g} body lengths) in "
         f"{motion.seconds:.3g} s, {when}"
     )
 
