@@ -267,7 +267,7 @@ def describe_runs(
             "seconds": float(np.mean([o.metrics["seconds"][-1] for o in outcomes])),
             **{
                 figure: as_numbers(interval([o.champion.get(figure, np.nan) for o in outcomes]))
-                for figure in ("score", "still_score")
+                for figure in ("score", "still_score", "speed_m_s")
             },
         }
         for name, outcomes in cases.items()

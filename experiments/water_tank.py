@@ -19,7 +19,7 @@ from mjx_revolve.engine.plant import actuators_of
 from mjx_revolve.engine.population import robot_acceleration
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.episodes.rollout import NO_INPUTS, Rollout, StepInputs, held, open_loop
-from mjx_revolve.numerics.xla import fuse, on_cpu
+from mjx_revolve.numerics.xla import OLD_EMITTERS, fuse, on_cpu
 from mjx_revolve.water.flow import water_of
 from mjx_revolve.water.world import World, load_world
 
@@ -30,7 +30,7 @@ EMPTY = {"gravity": 0.0, "buoyancy": "off", "drag": "off", "added_mass": False, 
 # Nor does one program have both cores: in one piece, it takes the compiler a fifth less.
 CHEAP = {
     "xla_backend_optimization_level": 0,
-    "xla_cpu_use_fusion_emitters": False,
+    **OLD_EMITTERS,
     "xla_cpu_parallel_codegen_split_count": 1,
 }
 

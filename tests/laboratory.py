@@ -31,7 +31,7 @@ from mjx_revolve.control.controller import Controller
 from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot, build_robot
-from mjx_revolve.numerics.xla import on_cpu
+from mjx_revolve.numerics.xla import OLD_EMITTERS, on_cpu
 from mjx_revolve.water.face_drag import FACES, FaceNumbers
 from mjx_revolve.water.world import World
 
@@ -96,7 +96,7 @@ def random_states(robot: Robot, lanes: int, seed: int = 0, speed: float = 1.0, d
 
 _USUAL = {
     "xla_backend_optimization_level": 3,
-    "xla_cpu_use_fusion_emitters": True,
+    **dict.fromkeys(OLD_EMITTERS, True),
     "xla_cpu_parallel_codegen_split_count": 32,
 }
 

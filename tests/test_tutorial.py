@@ -23,10 +23,11 @@ import yaml
 from laboratory import ROOT
 from mjx_revolve.episodes.config import load_config
 from mjx_revolve.episodes.tasks import score_unit
+from mjx_revolve.numerics.xla import OLD_EMITTERS
 from mjx_revolve.view.report.data import read_run
 
 TEXT = (ROOT / "docs" / "tutorial.md").read_text()
-QUICKLY = "--xla_cpu_use_fusion_emitters=false"
+QUICKLY = " ".join(f"--{name}=false" for name in OLD_EMITTERS)
 BLOCK = re.compile(r"(?:^`([^`\n]+)`:\n\n)?^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 

@@ -23,7 +23,6 @@ distinguished from one in this package.
 
 from __future__ import annotations
 
-import functools
 import itertools
 import os
 from collections.abc import Callable
@@ -53,6 +52,11 @@ _PIECE_OF_ONE = 350
 
 # Operations that cost more than a plain one; views cost nothing.
 _COST = {"sqrt": 8, "rsqrt": 8, "div": 8, "tanh": 20, "exp": 15, "atan2": 40, "sin": 20, "cos": 20}
+
+OLD_EMITTERS: dict[str, bool] = (
+    {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11, 1) else {}
+)
+"""XLA's older emitters compile faster. jaxlib 0.11.1 has them no more, and refuses the option."""
 
 # Views and copies: nothing is computed, so there is nothing to share.
 _VIEWS = {
@@ -95,20 +99,9 @@ def compiler_options(fast: bool = False) -> dict[str, Any] | None:
     """
     if not on_cpu():
         return None
-    wanted: dict[str, Any] = {"xla_cpu_prefer_vector_width": 512}
     if fast:
-        wanted = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-    return {name: value for name, value in wanted.items() if _is_known(name, value)}
-
-
-@functools.cache
-def _is_known(name: str, value: int) -> bool:
-    """Whether this jaxlib has an option: they are XLA's own, and come and go."""
-    try:
-        jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
-    except jax.errors.JaxRuntimeError:
-        return False
-    return True
+        return {"xla_backend_optimization_level": 0, **OLD_EMITTERS}
+    return {"xla_cpu_prefer_vector_width": 512}
 
 
 def jit(fun: Callable[..., PyTree], fast: bool = False, **settings: Any) -> Any:
