@@ -77,6 +77,9 @@ print(json.dumps({
 """
 
 
+_PYTHON = f"Python {sys.version_info.major}.{sys.version_info.minor}"
+
+
 def lowest_versions() -> list[str]:
     """A pin for each package that the base installation names."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
@@ -168,10 +171,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Columns that were not tried stay as they were found.
         place = RESULTS / "installations.json"
         older = json.loads(place.read_text("utf-8"))["numbers"]["columns"] if place.exists() else []
+        own = {f"{name}, {_PYTHON}": (name, one) for name, one in found.items()}
         known = {one["name"]: one for one in older} | {
-            name: {"name": name, **one, "found": describe(name, one)} for name, one in found.items()
+            title: {"name": title, **one, "found": describe(name, one)}
+            for title, (name, one) in own.items()
         }
-        columns = [known[name] for name in COLUMNS if name in known]
+        columns = [known[title] for name in COLUMNS for title in sorted(known) if name in title]
         write_results("installations", {"columns": columns}, ())
     return int(any("failed" in str(step) for one in found.values() for step in one.values()))
 
