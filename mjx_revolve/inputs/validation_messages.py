@@ -28,7 +28,7 @@ def refuse(problems: Mapping[str, str], origin: Callable[[str], str] = lambda _:
     """
     (place, text), *others = problems.items()
     line = ": ".join(part for part in (place, text) if part)
-    more = f" (and {len(others)} more: {', '.join(at for at, _ in others)})" if others else ""
+    more = f" (also wrong or missing: {', '.join(at for at, _ in others)})" if others else ""
     return InputError(f"{origin(place)}{line}{more}")
 
 

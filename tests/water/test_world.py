@@ -157,7 +157,7 @@ WRONG = [
     (
         {"shear": {"speed": 3}},
         f"shear.speed: expected one of {fields(Shear)}; found an unknown key "
-        "(and 1 more: shear.velocity)",
+        "(also wrong or missing: shear.velocity)",
     ),
     ({"gust": {"std": [1, -2, 0]}}, "gust.std.1: expected a number >= 0 [m/s]; found -2"),
     (
