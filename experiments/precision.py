@@ -539,6 +539,7 @@ def find_order(points: Sequence[dict[str, Any]]) -> float | None:
 def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """The diagram: a panel for each case, a line for each engine."""
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullFormatter
 
     names = list(dict.fromkeys(row["case"] for row in rows))
     columns = min(3, len(names))
@@ -555,6 +556,7 @@ def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
             )  # fmt: skip
         axis.axhline(_PERCENT, color="0.7", linewidth=0.8)
         axis.set_title(name, fontsize=9)
+        axis.xaxis.set_minor_formatter(NullFormatter())  # labels would overlap
         axis.set_xlabel("robot seconds per core second")
         axis.set_ylabel("error of the end [% of the way]")
         axis.legend(fontsize=7)
