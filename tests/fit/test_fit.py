@@ -345,6 +345,7 @@ def test_units_gaps_and_factors_of_columns(auv, tmp_path):
     columns = {"frame": 20 * columns["time"], "px": 500 * columns["x"], "y_mm": 1e3 * columns["y"],
                "z": columns["z"], "yaw_deg": np.degrees(columns["yaw"])}  # fmt: skip
     kept = np.r_[0:20, 30:60]
+    columns["prot"] = columns["z"]  # meant to be that of a thruster, perhaps
     write_csv(tmp_path / "swim.csv", {k: v[kept] for k, v in columns.items()})
     given = read_map(["time=frame*0.05", "x=px*0.002"])
     found = load_recording(tmp_path / "swim.csv", auv, given)
@@ -353,6 +354,7 @@ def test_units_gaps_and_factors_of_columns(auv, tmp_path):
     assert found.notes == (
         "frames at 20 Hz: 0 dropped, 1 gaps of up to 0.55 s",
         "no commands of bow, stern, starboard, port: taken to be 0",
+        "columns of no known name, not read: prot (--map NAME=COLUMN)",
     )
 
 
