@@ -126,7 +126,7 @@ def colony(name: str) -> Page:
     """A colony, from its beginning."""
     settings = ["evolution.generations=12", "evolution.checkpoint_every=12",
                 "evolution.population_size=32", "colony.birth.initial=20", "colony.birth.least=8",
-                "evolution.passport=false"]  # fmt: skip
+                "evolution.passport=false", "bodies.selection.passport=made"]  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "colony"
         if evolve.main(["lake_colony", "--out", str(run), *(f"--set={x}" for x in settings)]):
