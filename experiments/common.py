@@ -68,6 +68,21 @@ def as_numbers(found: Interval) -> dict[str, Any]:
     return {"mean": finite[0], "half": finite[1], "size": found.size, "text": str(found)}
 
 
+def read_rows(name: str, rows: str, folder: Path = RESULTS) -> list[dict[str, Any]]:
+    """Rows that `write_results` wrote before, for what adds to them.
+
+    Args:
+        name: of the study.
+        rows: their key in its numbers.
+        folder: where its file is.
+
+    Returns:
+        The rows; none where there is no file.
+    """
+    path = folder / f"{name}.json"
+    return json.loads(path.read_text("utf-8"))["numbers"][rows] if path.exists() else []
+
+
 def write_results(
     name: str, numbers: Mapping[str, Any], seeds: Sequence[int], folder: Path | None = None
 ) -> Path:

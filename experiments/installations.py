@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.common import RESULTS, ROOT, make_folder, make_parser, write_results
+from experiments.common import ROOT, make_folder, make_parser, read_rows, write_results
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
@@ -77,7 +77,8 @@ print(json.dumps({
 """
 
 
-_PYTHON = f"Python {sys.version_info.major}.{sys.version_info.minor}"
+# As in names of tox's environments.
+_PYTHON = f"py{sys.version_info.major}{sys.version_info.minor}"
 
 
 def lowest_versions() -> list[str]:
@@ -169,15 +170,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"Wrote {path}")
     if args.results:
         # Columns that were not tried stay as they were found.
-        place = RESULTS / "installations.json"
-        older = json.loads(place.read_text("utf-8"))["numbers"]["columns"] if place.exists() else []
-        own = {f"{name}, {_PYTHON}": (name, one) for name, one in found.items()}
-        known = {one["name"]: one for one in older} | {
-            title: {"name": title, **one, "found": describe(name, one)}
-            for title, (name, one) in own.items()
-        }
-        columns = [known[title] for name in COLUMNS for title in sorted(known) if name in title]
-        write_results("installations", {"columns": columns}, ())
+        columns = {row["name"]: row for row in read_rows("installations", "columns")}
+        for name, one in found.items():
+            title = f"{name}-{_PYTHON}"
+            columns[title] = {"name": title, **one, "found": describe(name, one)}
+        rows = [columns[title] for title in sorted(columns)]
+        write_results("installations", {"columns": rows}, ())
     return int(any("failed" in str(step) for one in found.values() for step in one.values()))
 
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import json
 import math
 import statistics
 import sys
@@ -29,7 +28,14 @@ from typing import Any, Protocol
 import numpy as np
 
 from experiments.bench_cases import DEPTH, PHYSICS
-from experiments.common import RESULTS, ROOT, make_folder, make_parser, write_results
+from experiments.common import (
+    RESULTS,
+    ROOT,
+    make_folder,
+    make_parser,
+    read_rows,
+    write_results,
+)
 from mjx_revolve.inputs.commands import run_command, whole
 from mjx_revolve.inputs.errors import InputError
 
@@ -609,10 +615,8 @@ def main(argv: list[str] | None = None) -> int:
 
 def save(rows: list[dict[str, Any]], folder: Path) -> None:
     """Adds a case to the results in a folder, and draws all of them."""
-    path = folder / "precision.json"
-    older = json.loads(path.read_text("utf-8"))["numbers"]["rows"] if path.exists() else []
     known: dict[str, list[dict[str, Any]]] = {}
-    for row in older:
+    for row in read_rows("precision", "rows", folder):
         known.setdefault(row["case"], []).append(row)
     known[rows[0]["case"]] = rows
     rows = [row for case in CASES for row in known.get(case.name, [])]

@@ -105,7 +105,8 @@ NAMES = "name, axis, place, leaves, by_number, first, age, mass, shade, green"
         ({"gren": 1}, f"gren: expected one of {NAMES}; found an unknown key; did you mean green?"),
         (
             {"age": -1, "green": 1, "colour": 2},
-            f"colour: expected one of {NAMES}; found an unknown key (also wrong or missing: age, green)",
+            f"colour: expected one of {NAMES}; found an unknown key "
+            "(also wrong or missing: age, green)",
         ),
     ],
 )
