@@ -192,6 +192,14 @@ def _keeps_depth(track: Track, settings: TaskConfig) -> jax.Array:
     return _keeping(middle - track.start_height, settings.depth_tolerance)
 
 
+def _counted(along: jax.Array, kept: jax.Array) -> jax.Array:
+    """What counts of a way along a direction: ahead what was made in place, back the whole.
+
+    Otherwise a robot that leaves its depth would lose nothing in a current that sweeps it away.
+    """
+    return jnp.where(along > 0, kept, along)
+
+
 def moved_through_water(track: Track) -> jax.Array:
     """`[S - 1, 3, lanes]` the robot's way from row to row, less that of the water around it [m]."""
     assert track.water_velocity is not None
@@ -202,15 +210,19 @@ def moved_through_water(track: Track) -> jax.Array:
 def directed_swim(track: Track, settings: TaskConfig) -> jax.Array:
     """Progress along a direction, over ground, while the robot keeps its depth [body lengths/s].
 
-    With a `horizon`, over that time, if the motion is continued: see `_foretold`.
+    What is lost counts at any depth. With a `horizon`, over that time, if the motion is continued:
+    see `_foretold`.
     """
     direction = np.asarray(settings.direction, float) / np.linalg.norm(settings.direction)
     moved = jnp.diff(track.position, axis=0)
     if settings.horizon is not None:
-        x, y = _foretold(track, settings, moved[:, :2])
-        return float(direction[0]) * x + float(direction[1]) * y
+        whole, kept = (
+            float(direction[0]) * x + float(direction[1]) * y
+            for x, y in _foretold(track, settings, moved[:, :2])
+        )
+        return _counted(whole, kept)
     along = sum(float(direction[i]) * moved[:, i] for i in range(3))
-    counted = jnp.sum(along * _keeps_depth(track, settings), 0)
+    counted = jnp.sum(_counted(along, along * _keeps_depth(track, settings)), 0)
     return counted / (track.duration * track.length)
 
 
@@ -222,17 +234,20 @@ def speed(track: Track, settings: TaskConfig) -> jax.Array:
     """
     moved = moved_through_water(track)[:, :2]
     if settings.horizon is not None:
-        return safe_norm(tuple(_foretold(track, settings, moved)))
+        return safe_norm(tuple(_foretold(track, settings, moved)[1]))
     counted = moved * _keeps_depth(track, settings)[:, None]
     return safe_norm(tuple(jnp.sum(counted, 0))) / (track.duration * track.length)
 
 
-def _foretold(track: Track, settings: Any, moved: jax.Array) -> jax.Array:
-    """`[2, lanes]` horizontal net velocity over the horizon, extrapolated from the track's halves.
+def _foretold(track: Track, settings: Any, moved: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Horizontal net velocity over the horizon, extrapolated from the track's halves.
 
     From one half to the next a robot turns by ψ and rises by some height. n displacements d, each
     turned by ψ from the one before, have the sum d sin(nψ/2) / sin(ψ/2), turned by (n - 1) ψ/2 from
-    the first: 0 for full circles [body lengths/s].
+    the first: 0 for full circles.
+
+    Returns:
+        `[2, lanes]` each [body lengths/s]: of the whole way, and of that at its depth.
     """
     half = moved.shape[0] // 2
     first, second = (jnp.sum(x, 0) for x in (moved[:half], moved[-half:]))
@@ -249,8 +264,9 @@ def _foretold(track: Track, settings: Any, moved: jax.Array) -> jax.Array:
     begun, ended = jnp.mean(height[: half + 1], 0), jnp.mean(height[-half - 1 :], 0)
     heights = begun + np.linspace(0, 1, _MOMENTS)[:, None] * count * (ended - begun)
     keeps = jnp.mean(_keeping(heights, settings.depth_tolerance), 0)
-    size = way * straight * keeps / (half * track.interval * track.length)
-    return size * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
+    towards = jnp.stack([jnp.cos(heading), jnp.sin(heading)])
+    unit = half * track.interval * track.length
+    return way * straight / unit * towards, way * straight * keeps / unit * towards
 
 
 def reach_target(track: Track, settings: TaskConfig) -> jax.Array:
@@ -303,7 +319,7 @@ def follow_course(track: Track, settings: TaskConfig) -> jax.Array:
     # At a sudden turn, the mean of the courses before and after counts.
     course = (track.course[1:] + track.course[:-1]) / 2
     along = jnp.sum(moved * course, 1)
-    counted = jnp.sum(along * _keeps_depth(track, settings), 0)
+    counted = jnp.sum(_counted(along, along * _keeps_depth(track, settings)), 0)
     return counted / (track.duration * track.length)
 
 
@@ -343,7 +359,8 @@ def crawl(track: Track, settings: TaskConfig) -> jax.Array:
     moved = jnp.diff(track.position, axis=0)
     along = sum(float(direction[i]) * moved[:, i] for i in range(3))
     middle = (track.clearance[1:] + track.clearance[:-1]) / 2
-    counted = jnp.sum(along * _keeping(middle, settings.depth_tolerance), 0)
+    kept = along * _keeping(middle, settings.depth_tolerance)
+    counted = jnp.sum(_counted(along, kept), 0)
     return counted / (track.duration * track.length)
 
 

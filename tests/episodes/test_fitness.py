@@ -136,6 +136,8 @@ SETTINGS = SimpleNamespace(
         ("directed_swim", track([0, -1, -2]), -2.0),
         ("directed_swim", track([0, 1, 2], z=[-1, -1, -1]), 0.0),  # not at its depth
         ("directed_swim", track([0, 1, 2], z=[0, 0, 2]), 1.0),  # for the first metre only
+        ("directed_swim", track([0, -1, -2], z=[-1, -1, -1]), -2.0),  # lost at any depth
+        ("crawl", track([0, -1, -2], clearance=0.5), -2.0),
         ("speed", track([0, -1, -2]), 2.0),
         ("speed", track([0, 1, 2], drift=1.0), 0.0),  # it drifted
         ("speed", track([0, 0, 0], drift=0.5), 1.0),  # it held its own
@@ -191,6 +193,9 @@ def test_a_horizon_foretells_when_depth_is_left():
     score = float(TASKS["speed"].score(track(time, z=0.002 * time), far)[0])
     assert score == pytest.approx(2.0 * 0.6, rel=0.1)
     assert float(TASKS["speed"].score(track(time, z=0.002 * time), SETTINGS)[0]) == 2.0
+    back = SimpleNamespace(horizon=120.0, depth_tolerance=0.1, direction=(-1.0, 0.0, 0.0))
+    lost = float(TASKS["directed_swim"].score(track(time, z=0.002 * time), back)[0])
+    assert lost == pytest.approx(-2.0, rel=1e-5)  # the whole way, at any depth
 
 
 def test_scores_in_metres_leave_the_body_length_out():
