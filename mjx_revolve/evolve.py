@@ -166,10 +166,13 @@ def _check(arguments: argparse.Namespace) -> Config | None:
     """The configuration, a wrong one refused before JAX is imported; None: no run folder."""
     path, folder = arguments.config, arguments.resume
     from mjx_revolve.episodes.config import load_config
+    from mjx_revolve.episodes.named_files import check_files
 
     if folder is None:
         with opening_config(path, arguments.trust):
-            return load_config(path, arguments.settings)
+            config = load_config(path, arguments.settings)
+            check_files(config)
+            return config
     if path is not None:
         find_shipped(path, "configs")  # a name that there is not is known at once
     found = Path(folder) / "config.yaml"

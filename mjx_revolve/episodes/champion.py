@@ -26,9 +26,9 @@ from mjx_revolve.episodes.fitness import (
     fit_body,
     make_fitness,
     make_mixed_fitness,
-    read_modules,
 )
 from mjx_revolve.episodes.individual_log import LoggedIndividual, find_individuals
+from mjx_revolve.episodes.named_files import read_modules
 from mjx_revolve.episodes.run_reader import ChampionRecord, RunReader, find_run, read_champion
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.episodes.simulate import Trajectory, simulate

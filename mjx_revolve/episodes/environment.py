@@ -26,7 +26,8 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 from mjx_revolve.control.sensors import Observer, make_observer, resolve_sensors
 from mjx_revolve.episodes.config import make_config
 from mjx_revolve.episodes.evaluation import Episodes, task_recorder
-from mjx_revolve.episodes.fitness import Fitness, read_modules
+from mjx_revolve.episodes.fitness import Fitness
+from mjx_revolve.episodes.named_files import read_modules
 from mjx_revolve.episodes.rollout import (
     Rollout,
     RolloutState,

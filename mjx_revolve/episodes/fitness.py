@@ -21,11 +21,9 @@ import numpy as np
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from mjx_revolve.body.catalogue import MODULES, load_modules
-from mjx_revolve.body.coefficients import correct_types, load_coefficients
 from mjx_revolve.body.edits import add_module, replace_module
 from mjx_revolve.body.module_types import ModuleType
-from mjx_revolve.body.morphology import Morphology, load_morphology, trim_neutral
+from mjx_revolve.body.morphology import Morphology, trim_neutral
 from mjx_revolve.control.controller import Controller, as_plant, bind_genes, gene_indices
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.control.readings import EpisodeContext, SensorMemory
@@ -50,6 +48,7 @@ from mjx_revolve.episodes.evaluation import (
     as_precise,
     task_recorder,
 )
+from mjx_revolve.episodes.named_files import read_modules, read_morphology, read_world
 from mjx_revolve.episodes.rollout import RolloutState, with_variation
 from mjx_revolve.episodes.scoring import average_trials, list_episodes, max_distance, may_touch_bed
 from mjx_revolve.episodes.simulate import Trajectory, simulate
@@ -59,7 +58,7 @@ from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.xla import materialize, over_chunks
 from mjx_revolve.water.drag import DRAG_LAWS, find_drag_law
 from mjx_revolve.water.flow import Water, water_of
-from mjx_revolve.water.world import World, load_world
+from mjx_revolve.water.world import World
 
 # Greatest time between the rows of a trace: enough for pictures that move [s].
 _TRACE_INTERVAL = 0.02
@@ -532,8 +531,7 @@ def make_fitness(
             f"{config.source}: morphology: expected one, as this is the fitness of one body; found "
             "bodies that evolve (see make_mixed_fitness)"
         )
-    modules = read_modules(config)
-    return fit_body(config, load_morphology(config.morphology, modules, config.allow_overlap))
+    return fit_body(config, read_morphology(config))
 
 
 def fit_body(config: Config, morphology: Morphology) -> Fitness:
@@ -652,14 +650,6 @@ def _diagonal(kind: ModuleType) -> float:
     return sum(float(np.linalg.norm(box.size)) for part in kind.parts for box in part.boxes)
 
 
-def read_modules(config: Config) -> Mapping[str, ModuleType]:
-    """All types of modules of a configuration, by name and alias."""
-    modules = MODULES | load_modules(config.modules) if config.modules else MODULES
-    if config.coefficients is None:
-        return modules
-    return correct_types(modules, load_coefficients(config.coefficients), config.coefficients)
-
-
 def _read(
     config: Config | str | Path | Mapping[str, object], overrides: dict[str, object]
 ) -> Config:
@@ -675,16 +665,7 @@ def _read(
 
 def _place(config: Config) -> tuple[World, Task]:
     """The world and the task, checked for compatibility."""
-    try:
-        world = load_world(config.world_name, **config.world_overrides)
-    except InputError as error:
-        name, _, text = str(error).partition(": ")
-        place = {"world": "world"}.get(name, "")
-        if name.startswith("world "):  # "world lake: density: expected ..."
-            place = f"world.{text.partition(':')[0]}"
-        before = config.origin(place)
-        typed = name != "world" and before != config.origin("")
-        raise InputError(before + (f"world.{text}" if typed else str(error))) from None
+    world = read_world(config)
     try:
         task = find_task(config.task, config.source)
     except InputError as error:

@@ -26,9 +26,9 @@ from mjx_revolve.episodes.fitness import (
     MixedFitness,
     fit_body,
     make_mixed_fitness,
-    read_modules,
 )
 from mjx_revolve.episodes.measure_table import MEASURES
+from mjx_revolve.episodes.named_files import read_modules
 from mjx_revolve.evolution.blocks import block_size
 from mjx_revolve.evolution.brains import BrainEncoding, GeneLayout, gene_layout, make_brain_encoding
 from mjx_revolve.genotypes.genotype import Genotype, Space, cached, make_space

@@ -13,7 +13,7 @@ import numpy as np
 
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology, make_morphology
-from mjx_revolve.episodes.fitness import read_modules
+from mjx_revolve.episodes.named_files import read_modules
 from mjx_revolve.genotypes.genotype import Genotype
 from mjx_revolve.inputs.errors import InputError, show
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.body.tree import Morphology
-from mjx_revolve.episodes.fitness import read_modules
+from mjx_revolve.episodes.named_files import read_modules
 from mjx_revolve.episodes.run_reader import RunReader
 from mjx_revolve.episodes.tasks import TASKS, score_unit
 from mjx_revolve.evolution.sweeps import Plan

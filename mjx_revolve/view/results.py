@@ -6,7 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mjx_revolve.episodes.config import Config
-from mjx_revolve.episodes.fitness import Fitness, read_modules
+from mjx_revolve.episodes.fitness import Fitness
+from mjx_revolve.episodes.named_files import read_modules
 from mjx_revolve.episodes.scoring import REPORT_EPISODES
 from mjx_revolve.episodes.tasks import score_unit
 from mjx_revolve.evolution.generations import Champion

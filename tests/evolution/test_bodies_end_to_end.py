@@ -10,7 +10,7 @@ from laboratory import QUICK
 from mjx_revolve import evolve as command
 from mjx_revolve.episodes.champion import load_episode
 from mjx_revolve.episodes.config import load_config
-from mjx_revolve.episodes.fitness import read_modules
+from mjx_revolve.episodes.named_files import read_modules
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.evolution.body_fitness import make_body_fitness
 from mjx_revolve.evolution.coevolution import BodyEvolution

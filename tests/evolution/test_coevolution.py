@@ -12,7 +12,7 @@ from mjx_revolve import evolve as command
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.episodes.champion import champion_number
 from mjx_revolve.episodes.config import load_config
-from mjx_revolve.episodes.fitness import read_modules
+from mjx_revolve.episodes.named_files import read_modules
 from mjx_revolve.evolution import run_folder as runs
 from mjx_revolve.evolution.coevolution import BodyEvolution
 from mjx_revolve.evolution.executor import Executor

@@ -16,7 +16,7 @@ from mjx_revolve.body.morphology import load_morphology, make_morphology, save_m
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.variants import course_targets
 from mjx_revolve.episodes.config import load_config
-from mjx_revolve.episodes.fitness import read_modules
+from mjx_revolve.episodes.named_files import read_modules
 from mjx_revolve.episodes.simulate import simulate
 from mjx_revolve.evolution.interrupts import Interrupts
 from mjx_revolve.fitting import (

@@ -15,8 +15,9 @@ from mjx_revolve.body.morphology import Morphology, load_morphology, trim_neutra
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.spheres import count_spheres
 from mjx_revolve.episodes.config import Config, load_config, override_config
-from mjx_revolve.episodes.fitness import MixedFitness, make_mixed_fitness, read_modules
+from mjx_revolve.episodes.fitness import MixedFitness, make_mixed_fitness
 from mjx_revolve.episodes.individual_log import INDIVIDUALS, read_individuals
+from mjx_revolve.episodes.named_files import read_modules, read_world
 from mjx_revolve.episodes.run_reader import RunReader, find_run
 from mjx_revolve.episodes.tasks import score_unit
 from mjx_revolve.inputs.errors import InputError
@@ -24,7 +25,7 @@ from mjx_revolve.inputs.shipped import find_shipped, list_shipped
 from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.view.live.simulation import CatalogueEntry
 from mjx_revolve.view.population import rank
-from mjx_revolve.water.world import World, load_world
+from mjx_revolve.water.world import World
 
 # The configuration with the default water and controller.
 _USUAL = "lake_swim"
@@ -101,7 +102,7 @@ def load_catalogue(paths: Sequence[str], world: str | None = None) -> RobotCatal
         "engine": "population", "task.duration": _WHILE, "task.horizon": None
     }  # fmt: skip
     config = override_config(config, changes | ({} if world is None else {"world": world}))
-    water = load_world(config.world_name, **config.world_overrides)
+    water = read_world(config)
     drafts: list[_Draft] = []
     for path, kind in named:
         if kind == "body":

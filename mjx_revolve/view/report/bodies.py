@@ -17,8 +17,8 @@ from PIL import Image
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.episodes.champion import load_individuals
-from mjx_revolve.episodes.fitness import read_modules
 from mjx_revolve.episodes.individual_log import LoggedIndividual
+from mjx_revolve.episodes.named_files import read_modules
 from mjx_revolve.evolution import archive as archives
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.archive_map import plot_archive

@@ -19,7 +19,8 @@ from matplotlib.figure import Figure
 from mjx_revolve import __version__
 from mjx_revolve.body.morphology import Morphology, load_morphology
 from mjx_revolve.episodes.config import Config
-from mjx_revolve.episodes.fitness import fit_body, make_fitness, read_modules
+from mjx_revolve.episodes.fitness import fit_body, make_fitness
+from mjx_revolve.episodes.named_files import read_modules
 from mjx_revolve.episodes.scoring import REPORT_EPISODES
 from mjx_revolve.evolution.fingerprints import model_hash
 from mjx_revolve.inputs.errors import InputError
