@@ -10,7 +10,7 @@ import inspect
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import jax
@@ -192,6 +192,12 @@ def _keeps_depth(track: Track, settings: TaskConfig) -> jax.Array:
     return _keeping(middle - track.start_height, settings.depth_tolerance)
 
 
+def _along(way: jax.Array, settings: TaskConfig) -> jax.Array:
+    """The part along the task's direction, of ways or velocities with x, y and maybe z first."""
+    direction = np.asarray(settings.direction, float) / np.linalg.norm(settings.direction)
+    return reduce(jnp.add, (float(u) * x for u, x in zip(direction, way, strict=False)))
+
+
 def _counted(along: jax.Array, kept: jax.Array) -> jax.Array:
     """What counts of a way along a direction: ahead what was made in place, back the whole.
 
@@ -213,15 +219,10 @@ def directed_swim(track: Track, settings: TaskConfig) -> jax.Array:
     What is lost counts at any depth. With a `horizon`, over that time, if the motion is continued:
     see `_foretold`.
     """
-    direction = np.asarray(settings.direction, float) / np.linalg.norm(settings.direction)
     moved = jnp.diff(track.position, axis=0)
     if settings.horizon is not None:
-        whole, kept = (
-            float(direction[0]) * x + float(direction[1]) * y
-            for x, y in _foretold(track, settings, moved[:, :2])
-        )
-        return _counted(whole, kept)
-    along = sum(float(direction[i]) * moved[:, i] for i in range(3))
+        return _counted(*(_along(v, settings) for v in _foretold(track, settings, moved[:, :2])))
+    along = _along(jnp.swapaxes(moved, 0, 1), settings)
     counted = jnp.sum(_counted(along, along * _keeps_depth(track, settings)), 0)
     return counted / (track.duration * track.length)
 
@@ -355,9 +356,7 @@ def follow_bed(track: Track, settings: Any) -> jax.Array:
 
 def crawl(track: Track, settings: TaskConfig) -> jax.Array:
     """Progress along a direction while the core stays near the bed [body lengths/s]."""
-    direction = np.asarray(settings.direction, float) / np.linalg.norm(settings.direction)
-    moved = jnp.diff(track.position, axis=0)
-    along = sum(float(direction[i]) * moved[:, i] for i in range(3))
+    along = _along(jnp.swapaxes(jnp.diff(track.position, axis=0), 0, 1), settings)
     middle = (track.clearance[1:] + track.clearance[:-1]) / 2
     kept = along * _keeping(middle, settings.depth_tolerance)
     counted = jnp.sum(_counted(along, kept), 0)
