@@ -3,8 +3,7 @@
 ``python -m experiments.budgets [--seeds N] [--only NAME,...] [--generations N] [--report]``
 
 `--generations` are those of co-evolution; the others get as many trials. Stopped by Ctrl-C, it goes
-on when it is started again; see `studies.py`. What all runs share stands in `lake_coevolve.yaml`,
-which is the co-evolution; every champion needs its passport.
+on when it is started again; see `studies.py`. What all runs share stands in `studies.yaml`.
 """
 
 from __future__ import annotations
@@ -14,7 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from experiments.common import ROOT, as_numbers
-from experiments.studies import Case, describe_runs, draw_outcomes, study_main
+from experiments.studies import (
+    BASE,
+    Case,
+    describe_runs,
+    draw_outcomes,
+    study_main,
+)
 from mjx_revolve.episodes.config import Config, load_config
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.files import write_atomic
@@ -24,7 +29,6 @@ from mjx_revolve.view.outcomes import Outcome, by_case, write_csv
 from mjx_revolve.view.plots import WIDE, figure_png, in_style, new_figure
 from mjx_revolve.view.statistics import difference, holm, rank_test
 
-BASE = ROOT / "configs" / "lake_coevolve.yaml"
 ROBOTS = ("spider", "gecko", "snake", "centipede", "fish")
 BRAINS = 64  # CMA-ES's population for one body: as many lanes as the step takes at a time, a choice
 EVOLVED: dict[str, Case] = {
@@ -61,11 +65,7 @@ def make_cases(settings: Sequence[str] = ()) -> dict[str, Case]:
         The cases by name.
     """
     generations = -(-count_trials(load_config(BASE, settings)) // BRAINS)
-    budget = (
-        f"evolution.population_size={BRAINS}",
-        f"evolution.generations={generations}",
-        "evolution.passport=required",
-    )
+    budget = f"evolution.population_size={BRAINS}", f"evolution.generations={generations}"
     return EVOLVED | {
         robot: Case(
             f"`morphologies/{robot}.yaml`, whose controller evolves by CMA-ES",
@@ -121,7 +121,7 @@ def write_report(folder: Path, outcomes: Sequence[Outcome]) -> dict[str, Any]:
 def main(argv: list[str] | None = None) -> int:
     """Runs the study, and reports it."""
     what = "Co-evolution, random search and hand-made bodies, each with as many trials."
-    return study_main("budgets", what, make_cases, write_report, argv, base=BASE)
+    return study_main("budgets", what, make_cases, write_report, argv)
 
 
 if __name__ == "__main__":

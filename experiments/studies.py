@@ -86,7 +86,6 @@ def study_main(
     write_report: Callable[[Path, Sequence[Outcome]], dict[str, Any]],
     argv: list[str] | None = None,
     add: Callable[[str, Figures], Figures] = lambda case, figures: {},
-    base: Path = BASE,
 ) -> int:
     """Runs a study, and reports it.
 
@@ -98,14 +97,13 @@ def study_main(
             numbers for a results file, `runs` among them.
         argv: the arguments; by default the command line's.
         add: as in `read_outcomes`.
-        base: the configuration that all runs start from.
 
     Returns:
         The exit code, see `run_study`.
     """
     argv = sys.argv[1:] if argv is None else argv
     options = study_parser(name, description, make_cases(())).parse_args(argv)
-    folder, plans = make_plans(make_cases(given_settings(options)), options, name, base)
+    folder, plans = make_plans(make_cases(given_settings(options)), options, name)
     if not options.report and (code := run_study(plans, name, argv)):
         return code
     outcomes = score_still(read_outcomes(plans, add))
@@ -126,7 +124,7 @@ def given_settings(options: argparse.Namespace) -> tuple[str, ...]:
 
 
 def make_plans(
-    cases: Mapping[str, Case], options: argparse.Namespace, name: str, base: Path
+    cases: Mapping[str, Case], options: argparse.Namespace, name: str
 ) -> tuple[Path, list[Plan]]:
     """The evolutions of a study.
 
@@ -134,7 +132,6 @@ def make_plans(
         cases: what is compared.
         options: from `study_parser`.
         name: of the experiment's module.
-        base: the configuration that they start from.
 
     Returns:
         The study's folder, and the plans.
@@ -145,7 +142,7 @@ def make_plans(
     folder = make_folder(options.out, name).resolve()
     given = given_settings(options)
     settings = {case: (*given, *cases[case].settings) for case in options.only}
-    return folder, plan_runs(folder, base, settings, range(options.seeds))
+    return folder, plan_runs(folder, BASE, settings, range(options.seeds))
 
 
 def run_study(

@@ -131,11 +131,11 @@ def test_environments_are_what_they_are_called():
 def test_budgets_are_equal(settings):
     cases = budgets.make_cases(settings)
     configs = {
-        name: Plan(name, 0, ROOT, budgets.BASE, (*settings, *case.settings)).config
+        name: Plan(name, 0, ROOT, studies.BASE, (*settings, *case.settings)).config
         for name, case in cases.items()
     }
     trials = budgets.count_trials(configs["coevolution"])
-    assert trials == (7 if settings else 20) * 16 * 2 * 32
+    assert trials == (24 + 6 * 16 if settings else 24 + 9 * 16) * 2 * 48
     assert budgets.count_trials(configs["random_search"]) == trials
     for robot in budgets.ROBOTS:
         assert configs[robot].bodies is None
