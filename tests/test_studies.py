@@ -135,7 +135,7 @@ def test_budgets_are_equal(settings):
         for name, case in cases.items()
     }
     trials = budgets.count_trials(configs["coevolution"])
-    assert trials == (24 + 6 * 16 if settings else 24 + 9 * 16) * 2 * 48
+    assert trials == (32 + (6 if settings else 31) * 64) * 8
     assert budgets.count_trials(configs["random_search"]) == trials
     for robot in budgets.ROBOTS:
         assert configs[robot].bodies is None
