@@ -161,8 +161,9 @@ def load_asked(arguments: argparse.Namespace) -> Episode:
         )
 
 
-def _settings(duration: float | None) -> dict[str, float]:
-    return {} if duration is None else {"task.duration": float(duration)}
+def _settings(duration: float | None) -> dict[str, float | None]:
+    # What swims longer than its horizon needs none.
+    return {} if duration is None else {"task.duration": float(duration), "task.horizon": None}
 
 
 def _champion(champion: ChampionRecord, duration: float | None, seed: int | None) -> Episode:

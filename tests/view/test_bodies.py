@@ -9,6 +9,7 @@ import pytest
 
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import make_morphology
+from mjx_revolve.episodes import champion as champions
 from mjx_revolve.episodes.individual_log import read_generations, read_individuals
 from mjx_revolve.view.body_pictures import SIZE, draw_bodies
 from mjx_revolve.view.population import (
@@ -23,7 +24,7 @@ from mjx_revolve.view.report.data import read_run
 SETTINGS = {
     "world": "empty_underwater",
     "controller": {"type": "sine"},
-    "task": {"type": "speed", "duration": 0.5, "settle": 0.1, "trials": 1},
+    "task": {"type": "speed", "duration": 0.5, "settle": 0.1, "trials": 1, "horizon": 1.0},
     "bodies": {"max_modules": 8, "max_hinges": 4},
     "evolution": {"population_size": 4, "generations": 3},
 }
@@ -215,3 +216,8 @@ def test_what_is_left_is_shown(run, still, damage, message):
     assert message in record.warning
     page = report_page.make_report([record])
     assert ("Body of individual" in page) == (run / "individuals.jsonl").is_file()
+
+
+def test_an_individual_is_shown_for_longer_than_its_horizon(run):
+    config, (one,) = champions.read_individuals(run, [5], duration=3.0)
+    assert config.task.duration == 3.0 and one.number == 5
