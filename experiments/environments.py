@@ -68,6 +68,8 @@ ENVIRONMENTS: dict[str, Case] = {
             f"world={{name: lake, current: [{CURRENT:g}, 0, 0]}}",
             "task.type=directed_swim",
             "task.direction=[-1, 0, 0]",
+            # All of the way counts, at any depth.
+            "task.depth_tolerance=2.0",
             "task.horizon=null",
         ),
     ),
