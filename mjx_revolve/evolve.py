@@ -125,7 +125,7 @@ def _lead(
     if folder is not None and arguments.out is not None:
         raise InputError(f"--resume {folder}: expected no --out beside it; found {arguments.out}")
     trust = arguments.trust
-    config = _check(arguments)
+    config = _check(arguments, files=make_fitness is None)
     print(plain(f"loading {folder or path}"), flush=True)  # it takes seconds
     if make_fitness is None and not arguments.cluster and runtime.expects_cpu():
         # They import JAX and the rest while this process does.
@@ -162,8 +162,11 @@ def _lead(
         run.close()
 
 
-def _check(arguments: argparse.Namespace) -> Config | None:
-    """The configuration, a wrong one refused before JAX is imported; None: no run folder."""
+def _check(arguments: argparse.Namespace, files: bool) -> Config | None:
+    """The configuration, a wrong one refused before JAX is imported; None: no run folder.
+
+    `files`: whether those that it names are read, too; another fitness may have others.
+    """
     path, folder = arguments.config, arguments.resume
     from mjx_revolve.episodes.config import load_config
     from mjx_revolve.episodes.named_files import check_files
@@ -171,7 +174,8 @@ def _check(arguments: argparse.Namespace) -> Config | None:
     if folder is None:
         with opening_config(path, arguments.trust):
             config = load_config(path, arguments.settings)
-            check_files(config)
+            if files:
+                check_files(config)
             return config
     if path is not None:
         find_shipped(path, "configs")  # a name that there is not is known at once
