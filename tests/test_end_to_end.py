@@ -84,10 +84,9 @@ def test_a_killed_run_resumed_equals_one_never_stopped(smoke, tmp_path):
 
 @pytest.mark.long
 def test_the_shipped_auv_holds_its_depth_as_its_file_says(tmp_path):
-    """With a seed that used to learn nothing; without thrust it scores -1.7 body lengths, and five
-    seeds score -0.04 to -0.13."""
+    """With a seed that used to learn nothing; without thrust it scores -1.7 body lengths."""
     command("evolve", "auv_hold_depth", "--seed", 4, "--out", tmp_path / "auv")
-    assert -0.15 < yaml.safe_load((tmp_path / "auv/champion/genes.yaml").read_text())["score"] < 0
+    assert -0.06 < yaml.safe_load((tmp_path / "auv/champion/genes.yaml").read_text())["score"] < 0
 
 
 def test_wrong_input_is_one_line_and_code_2():
