@@ -59,8 +59,8 @@ _NONE, _KEPT = -1e9, 1e9
 # of that [m/s]. Choices.
 _SLOP, _SHARE, _TOP = 5e-4, 1.0, 1.0
 # Rounds in which contacts are looked for, and by how much those of one round must turn a hinge for
-# a further one [rad]. Choices: half a degree moves the end of a limb by a millimetre.
-_ROUNDS, _TURN = 3, 0.01
+# a further one [rad]. Choices: 0.2 degrees move the end of a limb by .3 mm.
+_ROUNDS, _TURN = 3, 0.003
 # Sweeps over the forces of several contacts, and the error at which they end [m]. Choices: one
 # sweep is exact for one contact.
 _SWEEPS, _ENOUGH = 30, 2e-5

@@ -94,6 +94,23 @@ def test_servos_at_full_torque_press_less_than_2_mm(timestep):
     assert np.ptp(qpos[-20:, 7:], 0).max() < 1e-3
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("timestep", [0.005, 0.02])
+def test_a_plate_that_is_pressed_flat_on_a_face_lies_still(timestep):
+    """The end of an arm that is folded onto the core: two hinges turn it, a face carries it."""
+    tip = {"type": "FixedBrick", "children": {3: {"type": "ActiveHinge", "orientation": 270}}}
+    arm = {"type": "FixedBrick", "children": {3: tip}}
+    arm = {"type": "ActiveHinge", "orientation": 180, "children": {1: arm}}
+    folded = make_morphology({"type": "Core", "children": {3: arm}}, name="folded")
+    robot = build_robot(folded, water(timestep=timestep))
+    qpos, qvel = at_rest(robot, 2, -2.0)
+    qpos = march(robot, 2.0, qpos, qvel, np.array([[0.43, 0.43], [-0.1, 0.4]]))[1]
+    assert depths(robot, qpos).max() < 1e-3
+    later = qpos[round(1 / timestep) :, 7:]
+    assert np.abs(later).max() < 0.05  # it is pressed
+    assert np.abs(np.diff(later, axis=0)).max() / timestep < 2.0  # rattling, it had five times that
+
+
 def test_without_self_contact_arms_pass_through_each_other():
     robot = jaw(self_contact=False)
     qpos, qvel = open_jaw(robot)
