@@ -108,7 +108,8 @@ def test_a_plate_that_is_pressed_flat_on_a_face_lies_still(timestep):
     assert depths(robot, qpos).max() < 1e-3
     later = qpos[round(1 / timestep) :, 7:]
     assert np.abs(later).max() < 0.05  # it is pressed
-    assert np.abs(np.diff(later, axis=0)).max() / timestep < 2.0  # rattling, it had five times that
+    # Rattling, it had 26 rad/s at 5 ms and 3.5 at 20 ms.
+    assert np.abs(np.diff(later, axis=0)).max() / timestep < 2.0
 
 
 def test_without_self_contact_arms_pass_through_each_other():
