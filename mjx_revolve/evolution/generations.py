@@ -24,7 +24,7 @@ from mjx_revolve.evolution.strategies import FAILED_SCORE
 # (`REPORT_EPISODES`), because the best of several means is biased upwards, too.
 CHOOSE_EPISODES = 8
 # Number of best candidates for which a passport is made if required. A choice: half a minute each.
-_TRIED = 4
+_TRIED = 8
 # A stream of random numbers that no generation uses.
 CHOOSE_STREAM = 2**32 - 1
 

@@ -22,6 +22,9 @@ from mjx_revolve.inputs.errors import InputError
 # Descriptors with their population mean in the metrics.
 MEAN_DESCRIPTORS = ("num_modules", "num_hinges", "length", "mass", "branching", "limbs", "symmetry")
 
+# Number of candidates where a passport is required. A choice: some tens, as populations have.
+_CANDIDATES = 32
+
 
 class IndividualSearch(Protocol):
     """State of a search over individuals."""
@@ -53,19 +56,20 @@ class IndividualEvolution:
         return self._champion(elites[0], score=elites[0].score) if elites else None
 
     def choose_champion(self, search: IndividualSearch) -> Champion:
-        """The best of the elites on fresh starts, each alone at the configuration's task.
+        """The best candidate on fresh starts, each alone at the configuration's task.
 
         Raises:
             InputError: there is none: every individual failed.
         """
-        elites = _elites(search)
-        if not elites:
+        required = self.fitness.bodies.selection.passport == "required"
+        candidates = list_candidates(search, required)
+        if not candidates:
             raise InputError(
                 "champion: expected an individual with a score; found none: all failed"
             )
 
         def score(indices: Sequence[int], key: jax.Array) -> Scored:
-            chosen = [elites[k] for k in indices]
+            chosen = [candidates[k] for k in indices]
             genes = [
                 self.fitness.mixed.pad_genes(
                     np.array([one.genes], np.float32), self.fitness.build(one.body)
@@ -79,14 +83,13 @@ class IndividualEvolution:
         seed = self.config.evolution.seed
 
         def judge(k: int) -> Passport:
-            one = elites[k]
+            one = candidates[k]
             return make_passport(self.fitness.body_fitness(one.body), one.genes, seed)
 
-        required = self.fitness.bodies.selection.passport == "required"
         winner, judged = choose_candidate(
-            score, np.ones(len(elites), bool), seed, judge if required else None
+            score, np.ones(len(candidates), bool), seed, judge if required else None
         )
-        return self._champion(elites[winner], **judged)
+        return self._champion(candidates[winner], **judged)
 
     def _champion(self, one: Individual, **judged: Any) -> Champion:
         origin = f"individual {one.number} of generation {one.born}, {one.origin}"
@@ -96,6 +99,28 @@ class IndividualEvolution:
 
 def _elites(search: IndividualSearch) -> tuple[Individual, ...]:
     return search.elites or best_individuals(search.living)
+
+
+def list_candidates(search: IndividualSearch, required: bool) -> tuple[Individual, ...]:
+    """The individuals of which the champion is chosen.
+
+    Where coefficients are drawn anew in each generation, the best of all generations are those that
+    theirs favoured, and fail together. So where a passport is required the living compete, too.
+
+    Args:
+        search: its state.
+        required: whether a passport is.
+
+    Returns:
+        The elites, best first; then, where it is, the best of the other living ones.
+    """
+    elites = _elites(search)
+    if not required:
+        return elites
+    known = {one.number for one in elites}
+    others = [x for x in search.living if np.isfinite(x.score) and x.number not in known]
+    others.sort(key=lambda one: (-one.score, one.number))
+    return (*elites, *others[: _CANDIDATES - len(elites)])
 
 
 def finite_mean(values: Sequence[float] | np.ndarray) -> float:

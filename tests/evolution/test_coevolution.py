@@ -13,6 +13,8 @@ from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.episodes.champion import champion_number
 from mjx_revolve.episodes.config import load_config
 from mjx_revolve.episodes.named_files import read_modules
+from mjx_revolve.episodes.passport import Check, Passport
+from mjx_revolve.evolution import individual_search
 from mjx_revolve.evolution import run_folder as runs
 from mjx_revolve.evolution.coevolution import BodyEvolution
 from mjx_revolve.evolution.executor import Executor
@@ -100,6 +102,26 @@ def test_learning_improves_and_is_what_counts(folder):
     again = score_brains(executor, learned, wide, jax.random.split(key)[0])
     for (score, _), individual in zip(again, learned, strict=True):
         assert score[0] == pytest.approx(individual.score, abs=1e-6)
+
+
+def test_where_a_passport_is_required_the_living_are_candidates_too(folder, monkeypatch):
+    """What all elites fail, one of the other living passes, and becomes the champion."""
+    config, executor = start(folder, {"selection": {"type": "plus", "passport": "required"}})
+    search, _ = run(config, executor)
+    candidates = individual_search.list_candidates(search, True)
+    elites = individual_search.list_candidates(search, False)
+    others = [one.number for one in candidates[len(elites) :]]
+    assert elites == search.elites and others
+    assert set(others) == {one.number for one in search.living} - {one.number for one in elites}
+    failing = [one.genes for one in elites]
+
+    def judged(fitness, genes, seed):
+        right = tuple(genes) not in failing
+        return Passport({"kept": Check("kept", float(right), least=0.5)})
+
+    monkeypatch.setattr(individual_search, "make_passport", judged)
+    champion = BodyEvolution(config, executor).choose_champion(search)
+    assert champion.individual in others and not champion.passport.failed
 
 
 def watch(fitness, seen):
