@@ -118,9 +118,8 @@ def list_candidates(search: IndividualSearch, required: bool) -> tuple[Individua
     if not required:
         return elites
     known = {one.number for one in elites}
-    others = [x for x in search.living if np.isfinite(x.score) and x.number not in known]
-    others.sort(key=lambda one: (-one.score, one.number))
-    return (*elites, *others[: _CANDIDATES - len(elites)])
+    others = (one for one in search.living if one.number not in known)
+    return elites + best_individuals(others, _CANDIDATES - len(elites))
 
 
 def finite_mean(values: Sequence[float] | np.ndarray) -> float:

@@ -75,13 +75,15 @@ def features(individuals: Sequence[Individual], names: Sequence[str]) -> np.ndar
     return np.array(rows, float).reshape(len(individuals), len(names))
 
 
-def best_individuals(individuals: Iterable[Individual]) -> tuple[Individual, ...]:
-    """The `NUM_ELITES` with the best scores, each once and at its best; of equals, the older."""
+def best_individuals(
+    individuals: Iterable[Individual], count: int = NUM_ELITES
+) -> tuple[Individual, ...]:
+    """The `count` with the best scores, each once and at its best; of equals, the older."""
     best: dict[int, Individual] = {}
     for one in individuals:
         if np.isfinite(one.score):
             best[one.number] = max(best.get(one.number, one), one, key=lambda i: i.score)
-    return tuple(sorted(best.values(), key=lambda i: (-i.score, i.number))[:NUM_ELITES])
+    return tuple(sorted(best.values(), key=lambda i: (-i.score, i.number))[:count])
 
 
 # --- to and from files
