@@ -68,6 +68,18 @@ def test_draws_are_the_keys_and_within_their_ranges(settings):
     assert plain.variation is None and Variation._fields == tuple(RobustConfig.model_fields)
 
 
+def test_trials_of_a_generation_share_each_range_out(settings):
+    """Each of n trials has one nth of each range; which one, differs between the ranges."""
+    fitness, orders = make_fitness(settings, **{"task.trials": 5}), set()
+    for seed in range(8):
+        drawn = fitness.draw_starts(jax.random.key(seed)).variation._asdict()
+        shares = [np.log(np.asarray(x)) / np.log(WIDE[name]) for name, x in drawn.items()]
+        parts = np.floor((np.stack(shares) + 1) / 2 * 5).astype(int)
+        np.testing.assert_array_equal(np.sort(parts), np.tile(np.arange(5), (4, 1)))
+        orders |= set(map(tuple, parts))
+    assert len(orders) > 24
+
+
 @pytest.mark.long
 def test_one_body_and_many_and_its_replay(settings):
     """The same scores from both programs, and from the trajectory of each trial."""
