@@ -153,8 +153,8 @@ class Parts:
         half_size: half edges of the box [m].
         center_position: centre of the displaced volume [m].
         volume: displaced [m³].
-        steep: bound of the drag's gradient over the speed [kg/m]; next to endless without a bound
-            and with explicit laws.
+        steep: bound of the drag's gradient over the speed [kg/m], less where it acts on a thin
+            part's water; next to endless without a bound and with explicit laws.
         bulk: volume of the box [m³], for drag laws of whole bodies.
         exposed: share of each pair of faces that the water reaches [-], for surface tension.
         drag: numbers of their drag law; in `StepConstants`, those of all laws by name.

@@ -43,6 +43,7 @@ from mjx_revolve.water.laws import (
     map_fields,
     part_numbers,
 )
+from mjx_revolve.water.plate_wake import thinness
 
 # Stiffness of a joint's end stop, as full effort per this overshoot [rad]. A choice: stiff enough
 # to keep within half a degree of the real range; the step treats it implicitly, so it is stable.
@@ -316,13 +317,29 @@ _UNBOUNDED = 1e9
 
 
 def _steepness(
-    table: FluidTable, laws: Mapping[str, DragLaw], density: float
+    assembly: Assembly, laws: Mapping[str, DragLaw], numbers: Mapping[str, Any]
 ) -> Float[np.ndarray, " npart"]:
-    """How steep each part's drag is at most, see `Parts.steep`: g ρ A with the largest face A."""
-    bounds = {name: None if law.explicit else law.steepest for name, law in laws.items()}
-    bound = np.array([_UNBOUNDED if bounds[name] is None else bounds[name] for name in table.drag])
-    x, y, z = table.half_size.T
-    return bound * density * 4 * np.max([x * y, y * z, z * x], 0)
+    """How steep each part's drag is at most, see `Parts.steep`: g ρ A with the largest face A.
+
+    What drags a thin part acts across it, where it carries far more water than any other way. As
+    the step compares all drag with what a body carries at least, that of thin parts counts less.
+    """
+    table, density = assembly.fluid, assembly.world.density
+    x, y, z = 2 * table.half_size.T
+    face, steep = np.max([x * y, y * z, z * x], 0), np.empty(len(x))
+    for name, law in laws.items():
+        bound = None if law.explicit else law.steepest
+        if callable(bound):
+            found = density * bound(numbers[name])
+        else:
+            found = (_UNBOUNDED if bound is None else bound) * density * face
+        steep = np.where(np.array(table.drag) == name, found, steep)
+    if table.carries:
+        least, across = density * table.carried_mass.min(-1), table.half_size.argmin(-1)
+        more = density * table.carried_mass[np.arange(len(x)), across] - least
+        mass = (assembly.mass + np.bincount(table.body, least, len(assembly.mass)))[table.body]
+        steep *= mass / (mass + thinness(2 * table.half_size) * more)
+    return steep
 
 
 def _read_parts(assembly: Assembly, frame: np.ndarray) -> Parts:
@@ -336,20 +353,21 @@ def _read_parts(assembly: Assembly, frame: np.ndarray) -> Parts:
     swap = np.where(square[:, None, None], turn, np.eye(3))
     laws = {name: find_drag_law(name) for name in sorted({*table.drag})}
     whole = isinstance(find_drag_law(world.drag), BodyDragLaw)
+    drag = {
+        name: part_numbers(law, table, world)
+        for name, law in laws.items()
+        if isinstance(law, PartDragLaw)
+    }
     numbers: dict[str, Any] = dict(
         position=position,
         rotation=turn @ swap.swapaxes(1, 2),
         half_size=table.half_size,
         center_position=position + turned(turn, table.center_of_volume),
         volume=table.volume,
-        steep=_steepness(table, laws, world.density),
+        steep=_steepness(assembly, laws, drag),
         bulk=8 * table.half_size.prod(-1) if whole else None,
         exposed=table.exposed if world.surface_tension else None,
-        drag={
-            name: part_numbers(law, table, world)
-            for name, law in laws.items()
-            if isinstance(law, PartDragLaw)
-        },
+        drag=drag,
         carried=_carried(assembly, turn, position) if table.carries else None,
         mounts=_mounts(assembly, turn, position) if len(assembly.thruster_row) else None,
     )

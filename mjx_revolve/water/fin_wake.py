@@ -190,7 +190,7 @@ FIN_WAKE = PartDragLaw(
     summary="lift_drag with a lag of the lift, and drag that follows from it",
     explicit=False,
     varied=True,
-    steepest=10.0,  # lift: 2π, and drag
+    steepest=lambda fin: fin.gradient * fin.area,
     coefficients=(
         Coefficient(
             "nose_suction",

@@ -290,8 +290,8 @@ class DragLaw:
         explicit: whether a step takes it explicitly, which limits the time step.
         varied: whether `task.robust` varies it.
         steepest: bound g of the force's gradient: its derivative by the speed v is at most g ρ A v,
-            with A the part's largest face. None where there is none (drag that is linear in v) and
-            for laws that a step takes explicitly.
+            with A the part's largest face; or a function: numbers → g A [m²]. None where there is
+            none (drag that is linear in v) and for laws that a step takes explicitly.
         coefficients: what users may give for it.
         parameters: checked class of more of them, which modules have under its name, and worlds
             where they have a field of this name.
@@ -304,7 +304,7 @@ class DragLaw:
     sdf: Export
     explicit: bool
     varied: bool
-    steepest: float | None = None
+    steepest: float | Callable[[Any], np.ndarray] | None = None
     coefficients: tuple[Coefficient, ...] = ()
     parameters: type | None = None
     mj_fluidcoef: tuple[float, ...] = ()
