@@ -15,6 +15,7 @@ from laboratory import (
     arm_robot,
     at_rest,
     body,
+    check_engines,
     elbow_robot,
     march,
     oar_robot,
@@ -77,22 +78,24 @@ def relative(found, expected):
     return np.abs(found - expected).max(0) / np.abs(expected).max(0)
 
 
+def check_acceleration(robot, drag="off", lanes=32, error=1e-10, x64=True):
+    states = drawn(robot, lanes)
+    expected = mujoco_qacc(mujoco_model(robot, drag), *states)
+    assert relative(accelerate(robot, *states, x64=x64), expected).max() < error
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("drag", MUJOCO_LAWS)
 def test_acceleration_is_mujocos(drag):
     """To rounding of float64, with a current as MuJoCo's wind."""
     robot = stock(arm_robot(world(gravity=9.81, drag=drag, current=CURRENT)))
-    states = drawn(robot, 32)
-    expected = mujoco_qacc(mujoco_model(robot, drag), *states)
-    assert relative(accelerate(robot, *states), expected).max() < 1e-10
+    check_acceleration(robot, drag)
 
 
 def test_acceleration_in_float32():
     """Within 1e-5, what the population works with."""
     robot = stock(elbow_robot(world(gravity=9.81)))
-    states = drawn(robot, 32)
-    expected = mujoco_qacc(mujoco_model(robot, "off"), *states)
-    assert relative(accelerate(robot, *states, x64=False), expected).max() < 2e-5
+    check_acceleration(robot, error=2e-5, x64=False)
 
 
 @pytest.mark.slow
@@ -102,18 +105,14 @@ def test_acceleration_of_real_bodies(path):
     """Every shipped and wild morphology in MuJoCo's inertia box, float32."""
     morphology = load_morphology(path, allow_overlap=True)
     robot = stock(build_robot(morphology, world(gravity=9.81, drag="inertia_box")))
-    states = drawn(robot, 16)
-    expected = mujoco_qacc(mujoco_model(robot, "inertia_box"), *states)
-    assert relative(accelerate(robot, *states, x64=False), expected).max() < 2e-5
+    check_acceleration(robot, "inertia_box", lanes=16, error=2e-5, x64=False)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("drag", MUJOCO_LAWS)
 def test_acceleration_of_the_spider_in_float64(drag):
     robot = stock(build_robot(body("spider"), world(gravity=9.81, drag=drag)))
-    states = drawn(robot, 16)
-    expected = mujoco_qacc(mujoco_model(robot, drag), *states)
-    assert relative(accelerate(robot, *states), expected).max() < 1e-10
+    check_acceleration(robot, drag, lanes=16)
 
 
 LIMB = """
@@ -191,9 +190,7 @@ def test_a_body_of_equal_siblings_in_a_vacuum():
         f"    {slot}: {leg % '{type: ActiveHinge, orientation: 90}'}\n" for slot in (1, 0)
     )
     robot = stock(build_robot(read(text), world(gravity=9.81)))
-    states = drawn(robot, 16)
-    expected = mujoco_qacc(mujoco_model(robot, "off"), *states)
-    assert relative(accelerate(robot, *states), expected).max() < 1e-10
+    check_acceleration(robot, lanes=16)
 
 
 def test_several_children_upon_one_of_several_equal_links():
@@ -218,9 +215,7 @@ body:
             3: {id: e, type: ActiveHinge}
 """
     robot = stock(build_robot(read(text), world(gravity=9.81)))
-    states = drawn(robot, 16)
-    expected = mujoco_qacc(mujoco_model(robot, "off"), *states)
-    assert relative(accelerate(robot, *states), expected).max() < 1e-10
+    check_acceleration(robot, lanes=16)
 
 
 @pytest.mark.parametrize("drag", ["off", pytest.param("inertia_box", marks=pytest.mark.slow)])
@@ -252,22 +247,17 @@ FULL = {
 }
 
 
-def check_engines(robot):
+def check(robot):
     qpos, qvel, ctrl = drawn(robot, 4, speed=0.3)
     qpos[2] = [-0.2, -0.05, 0.0, 0.1]
     ctrl[:, 1] *= 3.0  # beyond its range: the servo stops there
-    _, q, v, energy = march(robot, 0.5, qpos, qvel, ctrl)
-    _, other_q, other_v, other_energy = march(robot, 0.5, qpos, qvel, ctrl, engine="mjx")
-    assert np.abs(q[-1] - qpos).max() > 0.05
-    assert other_q == pytest.approx(q, abs=1e-9)
-    assert other_v == pytest.approx(v, abs=1e-7)
-    assert other_energy == pytest.approx(energy, abs=1e-9)
+    check_engines(robot, qpos, qvel, ctrl)
 
 
 @pytest.mark.slow
 def test_the_two_engines_agree_on_one_module():
     """Through the surface, with drag, carried water and a current, half a second in float64."""
-    check_engines(build_robot(body("core"), world(**WATER, current=CURRENT)))
+    check(build_robot(body("core"), world(**WATER, current=CURRENT)))
 
 
 @pytest.mark.slow
@@ -276,7 +266,7 @@ def test_the_two_engines_agree_on_one_module():
 def test_the_two_engines_agree(case):
     """The same with hinges and servos, and each of the other laws."""
     make, fields = FULL[case]
-    check_engines(make(world(**WATER | fields)))
+    check(make(world(**WATER | fields)))
 
 
 @pytest.mark.slow

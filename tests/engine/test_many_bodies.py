@@ -55,12 +55,7 @@ def zoo(name):
     return tuple(build_robot(b, tank) for b in bodies)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick_compiles():
-    """Leaves out the compiler's optimisations; test_end_to_end.py runs with them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
-        yield
+pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 
 def states(robots, capacity, each, depth):

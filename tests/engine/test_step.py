@@ -40,12 +40,7 @@ RHO, G = 999.1026, 9.81
 CUBE = (0.1, 0.1, 0.1)  # carries the same water along every axis, so no Munk moment turns it
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick_compiles():
-    """Leaves out the compiler's optimisations: they cost more than these short runs save."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
-        yield
+pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 
 def impulse(lagrangian, qpos, qvel):

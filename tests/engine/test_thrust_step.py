@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from laboratory import (
-    QUICK,
     WATER,
     accelerate,
     at_rest,
     body,
     box_robot,
+    check_engines,
     face_drag,
     march,
     random_states,
@@ -29,12 +29,7 @@ CUBE = (0.1, 0.1, 0.1)
 NEUTRAL = RHO * 1e-3
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick_compiles():
-    """Leaves out the compiler's optimisations: they cost more than these short runs save."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
-        yield
+pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 
 def driven(tank, **thruster):
@@ -152,12 +147,7 @@ def test_the_two_engines_agree(name):
     qpos, qvel = random_states(robot, 4, speed=0.3)
     qpos[2] = [-0.5, -0.05, 0.0, 0.1]
     ctrl = np.random.default_rng(1).uniform(-1.2, 1.2, (robot.mj_model.nu, 4))
-    _, q, v, work = march(robot, 0.5, qpos, qvel, ctrl)
-    _, other_q, other_v, other_work = march(robot, 0.5, qpos, qvel, ctrl, engine="mjx")
-    assert np.abs(q[-1] - qpos).max() > 0.05
-    assert other_q == pytest.approx(q, abs=1e-9)
-    assert other_v == pytest.approx(v, abs=1e-7)
-    assert other_work == pytest.approx(work, abs=1e-9)
+    check_engines(robot, qpos, qvel, ctrl)
 
 
 @pytest.mark.slow

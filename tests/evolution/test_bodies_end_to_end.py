@@ -6,7 +6,6 @@ import jax
 import numpy as np
 import pytest
 
-from laboratory import QUICK
 from mjx_revolve import evolve as command
 from mjx_revolve.episodes.champion import load_episode
 from mjx_revolve.episodes.config import load_config
@@ -28,11 +27,6 @@ CONFIG = {
     "bodies": {"max_modules": 5, "max_hinges": 2, "learning": {"population_size": 3}},
     "evolution": {"population_size": 4, "generations": 2, "checkpoint_every": 1, "passport": False},
 }
-
-
-@pytest.fixture
-def quick_compiles(monkeypatch):
-    monkeypatch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
 
 
 @pytest.mark.slow

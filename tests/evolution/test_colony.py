@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from laboratory import QUICK, ROOT
+from laboratory import ROOT
 from mjx_revolve.episodes.colony_config import ColonyConfig, EnergyConfig, LifeConfig
 from mjx_revolve.episodes.config import load_config, make_config
 from mjx_revolve.episodes.tank import TankTrajectory
@@ -94,12 +94,7 @@ def fitness(config):
     return make_body_fitness(config)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick_compiles():
-    """Leaves out the compiler's optimisations."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
-        yield
+pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 
 @pytest.fixture(scope="module")

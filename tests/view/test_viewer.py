@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from browser import Browser, needs_browser
-from laboratory import QUICK, ROOT, WATER, body, box_robot, world
+from laboratory import ROOT, WATER, body, box_robot, world
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.champion import Episode
 from mjx_revolve.episodes.simulate import Trajectory
@@ -388,11 +388,6 @@ def test_the_browser_poses_robots_as_mujoco_does(browser, colony, robots):
     assert bones[:, :3] == pytest.approx(expected.position[0, 1:], abs=2e-5)
     quat = expected.quaternion[0, 1:][:, [1, 2, 3, 0]]
     assert np.abs((bones[:, 4:] * quat).sum(1)) == pytest.approx(1, abs=1e-5)
-
-
-@pytest.fixture
-def quick_compiles(monkeypatch):
-    monkeypatch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
 
 
 CORE = str(ROOT / "morphologies" / "core.yaml")
