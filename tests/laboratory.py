@@ -179,21 +179,16 @@ body:
         1: {id: tip, type: ActiveHinge, orientation: 90}
 """
 _ELBOW = """
-id: elbow
 body:
-  id: core
   type: Core
   children:
     1:
-      id: shoulder
       type: ActiveHinge
       orientation: 90
       children:
         1:
-          id: upper
           type: FixedBrick
-          children:
-            2: {id: wrist, type: ActiveHinge, orientation: 180, children: {1: {type: FixedBrick}}}
+          children: {2: {type: ActiveHinge, orientation: 180, children: {1: {type: FixedBrick}}}}
 """
 
 

@@ -243,9 +243,7 @@ def test_in_a_batch_of_different_bodies_they_feel_the_same(robot, spiders):
 
 
 PADS = """
-id: padded
 body:
-  id: core
   type: Core
   children:
     0: {id: rear, type: FixedBrick, children: {1: {id: pad, type: TouchSensor}}}

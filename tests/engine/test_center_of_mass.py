@@ -45,9 +45,7 @@ def test_the_centre_of_mass_is_mujocos(engine):
 
 # A core with an arm on its front and one on its right: folded by a right angle at rest.
 CORNER = """
-id: corner
 body:
-  id: core
   type: Core
   children:
     0: {id: b0, type: ActiveHinge, children: {1: {id: b1, type: FixedBrick}}}

@@ -202,17 +202,9 @@ body:
   type: Core
   children:
     0: {id: left, type: ActiveHinge, children: {1: {id: a, type: FixedBrick}}}
-    1:
-      id: right
-      type: ActiveHinge
-      children:
-        1:
-          id: b
-          type: FixedBrick
-          children:
-            1: {id: c, type: ActiveHinge}
-            2: {id: d, type: ActiveHinge}
-            3: {id: e, type: ActiveHinge}
+    1: {id: right, type: ActiveHinge, children: {1: {id: b, type: FixedBrick, children: {
+      1: {id: c, type: ActiveHinge}, 2: {id: d, type: ActiveHinge}, 3: {id: e, type: ActiveHinge},
+    }}}}
 """
     robot = stock(build_robot(read(text), world(gravity=9.81)))
     check_acceleration(robot, lanes=16)

@@ -16,19 +16,8 @@ from mjx_revolve.episodes.tasks import TASKS, Track, find_task, score_unit, show
 
 KEY = jax.random.key(7)
 # The smallest robot with joints: compiles fast.
-ROBOT = """
-id: oar
-body:
-  id: core
-  type: Core
-  children:
-    1:
-      id: hinge
-      type: ActiveHinge
-      orientation: 90
-      children:
-        1: {id: blade, type: FixedBrick, orientation: -90}
-"""
+_ARM = "{type: ActiveHinge, orientation: 90, children: {1: {type: FixedBrick, orientation: -90}}}"
+ROBOT = f"body: {{type: Core, children: {{1: {_ARM}}}}}"
 TASK = {"type": "speed", "duration": 1.0, "settle": 0.2, "trials": 2}
 
 

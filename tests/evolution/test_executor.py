@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import toys
-from laboratory import ROOT, XLA_FLAGS
+from laboratory import OAR, ROOT, XLA_FLAGS
 from mjx_revolve import evolve as command
 from mjx_revolve.episodes.config import load_config
 from mjx_revolve.evolution import jobs
@@ -355,6 +355,7 @@ def test_workers_of_another_program_score_nothing(tmp_path, caplog):
 SCRIPT = """
 import sys
 import toys
+from laboratory import OAR
 from mjx_revolve import evolve
 from mjx_revolve.inputs.commands import run_command
 
@@ -409,22 +410,12 @@ def test_workers_do_not_outlive_their_leader(folder):
     wait_for(lambda: not any(map(is_alive, workers)))
 
 
-ROBOT = """
-id: knee
-body:
-  id: core
-  type: Core
-  children:
-    1: {id: knee, type: ActiveHinge, children: {1: {id: foot, type: FixedBrick}}}
-"""
-
-
 @pytest.mark.slow
 def test_a_robot_does_not_depend_on_its_workers(tmp_path, monkeypatch):
     (tmp_path / "cache").mkdir()
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
     path = toys.write_config(tmp_path / "knee.yaml", population_size=10)
-    (tmp_path / "robot.yaml").write_text(ROBOT)
+    (tmp_path / "robot.yaml").write_text(OAR)
     config = load_config(path, ["task.trials=16", "task.duration=0.2", "task.settle=0.05"])
     found = []
     for count in (2, 1):
