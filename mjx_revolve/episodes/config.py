@@ -179,8 +179,7 @@ class ControllerConfig(Section):
 class RobustConfig(Settings):
     """Largest factors by which coefficients are multiplied or divided, drawn anew for each trial.
 
-    Uniform in the factor's logarithm, the same for all individuals; of n trials each has another
-    nth of each range (a Latin hypercube).
+    Uniform in the factor's logarithm, the same for all individuals.
     """
 
     drag: Annotated[Number, Ge(1), Le(10), Unit("-")] = 1.5
@@ -282,6 +281,9 @@ class TaskConfig(Section):
     robust: Annotated[RobustConfig | None, BeforeValidator(_read_robust)] = None
     """`true`, or ranges: coefficients of water and motors are drawn anew in each generation, for
     each trial, the same for all individuals, so that champions do not live on one number."""
+    robust_draws: Literal["independent", "stratified"] = "independent"
+    """`stratified`: of n trials each has another nth of each range of `robust`, so that scores of
+    different generations are alike: what a lucky draw favours does not stay for it."""
     measures: TupleOf[Annotated[str, AfterValidator(_check_measure)]] = ()
     """Names of further measures, of `measure_table.MEASURES`."""
     params: Annotated[dict[str, Any], File("data")] = Field({})

@@ -138,18 +138,20 @@ def _draw_course(task: TaskConfig, key: jax.Array) -> Course | None:
 
 
 def _draw_variation(task: TaskConfig, key: jax.Array) -> Variation | None:
-    """Factors within the ranges of `task.robust`, `[trials]` each.
+    """Factors within the ranges of `task.robust`, uniformly in their logarithm, `[trials]` each.
 
-    A Latin hypercube (McKay, Beckman & Conover 1979) in the factors' logarithms: with n trials each
-    factor falls once into each nth part of its range. So no draw has weak motors only, and scores
-    of different generations are alike.
+    Stratified draws are a Latin hypercube (McKay, Beckman & Conover 1979).
     """
     if task.robust is None:
         return None
-    rank_key, share_key = jax.random.split(jax.random.fold_in(key, 5))
-    ranks = jnp.tile(jnp.arange(task.trials), (len(Variation._fields), 1))
-    ranks = jax.random.permutation(rank_key, ranks, axis=1, independent=True)
-    shares = 2 * (ranks + jax.random.uniform(share_key, ranks.shape)) / task.trials - 1
+    key = jax.random.fold_in(key, 5)
+    if task.robust_draws == "independent":
+        shares = jax.random.uniform(key, (4, task.trials), minval=-1.0)
+    else:
+        rank_key, share_key = jax.random.split(key)
+        ranks = jnp.tile(jnp.arange(task.trials), (4, 1))
+        ranks = jax.random.permutation(rank_key, ranks, axis=1, independent=True)
+        shares = 2 * (ranks + jax.random.uniform(share_key, ranks.shape)) / task.trials - 1
     ranges = [getattr(task.robust, name) for name in Variation._fields]
     return Variation(*(width**share for width, share in zip(ranges, shares, strict=True)))
 

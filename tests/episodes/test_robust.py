@@ -68,9 +68,10 @@ def test_draws_are_the_keys_and_within_their_ranges(settings):
     assert plain.variation is None and Variation._fields == tuple(RobustConfig.model_fields)
 
 
-def test_trials_of_a_generation_share_each_range_out(settings):
+def test_stratified_draws_share_each_range_out(settings):
     """Each of n trials has one nth of each range; which one, differs between the ranges."""
-    fitness, orders = make_fitness(settings, **{"task.trials": 5}), set()
+    changes, orders = {"task.trials": 5, "task.robust_draws": "stratified"}, set()
+    fitness = make_fitness(settings, **changes)
     for seed in range(8):
         drawn = fitness.draw_starts(jax.random.key(seed)).variation._asdict()
         shares = [np.log(np.asarray(x)) / np.log(WIDE[name]) for name, x in drawn.items()]
