@@ -38,6 +38,7 @@ from mjx_revolve.numerics.inertia import (
     SpatialInertia,
     add_block,
     add_inertia,
+    apply_block,
     apply_inertia,
     block_of,
     cross_force,
@@ -70,6 +71,8 @@ from mjx_revolve.water.world import World
 _NO_MATRIX = ((0.0,) * 3,) * 3
 _NO_BLOCK = Block(_NO_MATRIX, _NO_MATRIX, _NO_MATRIX, _NO_MATRIX)
 _NO_BIAS = ((0.0,) * 3, (0.0,) * 3)
+# The hinge's axis in its body's frame, (angular, linear).
+_AXIS = ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
 
 
 def accelerate(
@@ -89,6 +92,11 @@ def accelerate(
     body with many times its mass of water until it blows up. h itself is extrapolated to the
     middle from the step before, for second order.
 
+    A hinge's axis z turns with its body, too. The body's acceleration from the hinge, z q̈ + ν × z q̇,
+    takes ν × z from the step before as well, and q̇ in the step's middle from the acceleration that
+    is sought: (z + dt/2 ν × z) q̈ + ν × z q̇. What jumps in a step is the hinge's acceleration, as a
+    servo begins to push or a stop holds it.
+
     Args:
         tree: the robots.
         state: the population, its velocities relative to the uniform current.
@@ -106,14 +114,19 @@ def accelerate(
     world, symmetric = tree.world, not (tree.carries and dt)
     meets = tree.meets and dt > 0
     located = has_acceleration(water) or needs_horizontal_position(world) or tree.touches
-    root, moved, midpoint_speed = forward_kinematics(tree, state, located, dt)
-    if symmetric:
-        midpoint_speed = state.speed
+    root, moved = forward_kinematics(tree, state, located, dt)
 
     def turning(motion: BodyMotion) -> tuple[Vec, Vec]:
         """The velocity with which momenta turn: as MuJoCo's step has it, the step's first one."""
         first = motion.angular_velocity, motion.velocity
         return first if symmetric else motion.midpoint_velocity
+
+    def axis_of(motion: BodyMotion) -> tuple[Vec, Vec]:
+        """The hinge's axis, half a step ahead where momenta are."""
+        if symmetric:
+            return _AXIS
+        angular, linear = _coriolis(turning(motion), 0.5 * dt)
+        return vadd(_AXIS[0], angular), vadd(_AXIS[1], linear)
 
     def articulate(level: Level, children: Any, moved: Any, *xs: Any) -> tuple[Any, Any, Scalar]:
         """Articulated inertia and bias of bodies, seen from their parents; the root's own."""
@@ -134,31 +147,33 @@ def accelerate(
         if level.hinges is None:
             return found, submerged, 0.0
         block, bias = _unflatten(found, symmetric)
-        angle, speed, midpoint_speed, target = rest
+        angle, speed, target = rest
         load, inertia = _passive(level.hinges, angle, speed, dt)
-        moved_inertia, moved_load = add(block.angular[2][2], inertia), sub(load, bias[0][2])
+        axis = axis_of(motion)
+        column = apply_block(block, *axis)
+        moved_inertia, moved_load = add(column[0][2], inertia), sub(load, bias[0][2])
         motor, motor_inertia = servo(
             level.hinges, angle, speed, target, dt, moved_inertia, moved_load
         )
-        column = tuple(tuple(x[i][2] for i in range(3)) for x in (block.angular, block.back))
         block, bias, joint = eliminate_joint(
             block,
             bias,
+            column,
             add(inertia, motor_inertia),
             add(motor, load),
-            _coriolis(turning(motion), midpoint_speed),
+            _coriolis(turning(motion), speed),
             symmetric,
         )
         block, bias = to_parent(rotation, level.hinges.position, block, bias, symmetric)
-        # What a unit of the hinge's acceleration takes; else that is the row of `joint`.
-        column = column if meets and not symmetric else ()
-        saved = joint, tree.unstack_parts(submerged), column
+        # Of a unit of the hinge's acceleration; else they are the row of `joint` and `_AXIS`.
+        unit = (column, axis) if meets and not symmetric else ()
+        saved = joint, tree.unstack_parts(submerged), unit
         return _flatten(block, bias, symmetric), saved, jnp.abs(motor * speed)
 
     children, saved, power = tree.backward_pass(
         articulate,
         (_flatten(_NO_BLOCK, _NO_BIAS, symmetric), 0.0),
-        moved, state.angle, state.speed, midpoint_speed, targets, *state.submerged[1:], *wrench[1:],
+        moved, state.angle, state.speed, targets, *state.submerged[1:], *wrench[1:],
     )  # fmt: skip
     whole, submerged, _ = articulate(
         tree.root, children, (root, None), *state.submerged[:1], *wrench[:1]
@@ -167,19 +182,18 @@ def accelerate(
 
     def accelerate_joint(level: Level, parent: Any, *x: Any) -> tuple[Any, Scalar]:
         """Accelerations of bodies from those of their parents, and of their hinges."""
-        (motion, rotation), midpoint_speed, (joint, *_) = x
+        (motion, rotation), speed, (joint, *_) = x
         assert level.hinges is not None
         angular, linear = parent
-        coriolis = _coriolis(turning(motion), midpoint_speed)
+        coriolis = _coriolis(turning(motion), speed)
         a = vadd(matTvec(rotation, angular), coriolis[0])
         position = level.hinges.position
         b = vadd(matTvec(rotation, vadd(linear, cross(angular, position))), coriolis[1])
         hinge = sub(sub(joint.rest, dot(joint.row_a, a)), dot(joint.row_l, b))
         hinge = mul(joint.inverse, hinge)
-        own = (a[0], a[1], add(a[2], hinge)), b
-        return own, hinge
+        return _along(axis_of(motion), hinge, (a, b)), hinge
 
-    hinges = tree.forward_pass(accelerate_joint, (angular, linear), moved, midpoint_speed, saved)
+    hinges = tree.forward_pass(accelerate_joint, (angular, linear), moved, state.speed, saved)
     lanes, dtype = state.position[0].shape, state.position[0].dtype
     lane = lambda x: jnp.broadcast_to(jnp.asarray(x, dtype), (1, *lanes))[0]  # noqa: E731
     qacc = tuple(map(lane, linear)), tuple(map(lane, angular)), hinges
@@ -195,6 +209,11 @@ def accelerate(
         clearance,
         pressed,
     )
+
+
+def _along(axis: tuple[Vec, Vec], hinge: Scalar, rest: tuple[Vec, Vec]) -> tuple[Vec, Vec]:
+    """Acceleration of a body by its hinge's along its axis, added to the rest."""
+    return vadd(rest[0], vscale(hinge, axis[0])), vadd(rest[1], vscale(hinge, axis[1]))
 
 
 class _Factors(NamedTuple):
@@ -254,10 +273,10 @@ def _make_respond(
     def collect(_: Level, children: Any, turn: Any, place: Any, saved: Any, torque: Any) -> Any:
         """Bias forces, as the parents feel them."""
         bias = (0.0,) * 6 if children is None else children
-        (row_a, row_l, inverse), column = saved
+        (row_a, row_l, inverse), unit = saved
         rest = sub(torque, bias[2])
         pushed = mul(inverse, rest)
-        column = column or (row_a, row_l)
+        column = unit[0] if unit else (row_a, row_l)
         torque = vadd(bias[:3], vscale(pushed, column[0]))
         force = matvec(turn, vadd(bias[3:], vscale(pushed, column[1])))
         torque = vadd(matvec(turn, torque), cross(place, force))
@@ -269,9 +288,9 @@ def _make_respond(
         angular, linear = parent
         a = matTvec(turn, angular)
         b = matTvec(turn, vadd(linear, cross(angular, place)))
-        (row_a, row_l, inverse), _ = saved
+        (row_a, row_l, inverse), unit = saved
         hinge = mul(inverse, sub(sub(rest, dot(row_a, a)), dot(row_l, b)))
-        return ((a[0], a[1], add(a[2], hinge)), b), hinge
+        return _along(unit[1] if unit else _AXIS, hinge, (a, b)), hinge
 
     def respond(torque: jax.Array) -> jax.Array:
         bias, rests, _ = few.backward_pass(

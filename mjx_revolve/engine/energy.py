@@ -143,7 +143,7 @@ def _powers(
     def whole(rates: Any) -> dict[str, jax.Array]:
         """Sums over the robot, with these velocities at the end of the step."""
         end = before._replace(**dict(zip(_RATES, rates, strict=True)))
-        motions = [forward_kinematics(tree, x, True)[:2] for x in (before, end)]
+        motions = [forward_kinematics(tree, x, True) for x in (before, end)]
         roots, moved = zip(*motions, strict=True)
         found = [_on_bodies(tree.world, tree.root, roots, water, thrusts)]
         below = zip(*moved, before.angle, before.speed, end.speed, targets, strict=True)

@@ -39,7 +39,7 @@ _ZERO = (0.0, 0.0, 0.0)
 def _in_current(tree: Tree, state: State, water: Water) -> tuple[BodyMotion, Any]:
     """Motion of the root and of the bodies below it, relative to the uniform current."""
     relative = state._replace(velocity=vsub(state.velocity, water.current))
-    root, below, _ = forward_kinematics(tree, relative, True)
+    root, below = forward_kinematics(tree, relative, True)
     return root, below
 
 

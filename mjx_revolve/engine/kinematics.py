@@ -36,7 +36,7 @@ from mjx_revolve.numerics.spatial import (
 
 def forward_kinematics(
     tree: Tree, state: State, located: bool, dt: float = 0.0
-) -> tuple[BodyMotion, Any, Any]:
+) -> tuple[BodyMotion, Any]:
     """Pose and velocity of all bodies.
 
     Args:
@@ -47,7 +47,7 @@ def forward_kinematics(
 
     Returns:
         The root's motion; (motion, rotation parent from child) of the bodies below it, as the tree
-        stores them; and the hinges' speeds half a step ahead.
+        stores them.
     """
     rotation = tuple(map(_row, quat_to_mat(state.quat)))
     velocity, midpoint_speed, midpoint = _row(state.velocity), state.speed, None
@@ -90,7 +90,7 @@ def forward_kinematics(
         return motion, (motion, rotation)
 
     below = tree.forward_pass(move, root, state.angle, state.speed, midpoint_speed)
-    return root, below, midpoint_speed
+    return root, below
 
 
 def _row(xs: Any) -> Any:
@@ -180,7 +180,7 @@ def body_motions(tree: Tree, state: State) -> BodyMotion:
         `[1 + nhinge, lanes]` each, in the order of `Tree.join_rows`; velocities over ground. Each
         body's frame lies at its hinge and has the hinge's axis for its z (see `level`).
     """
-    root, below, _ = forward_kinematics(tree, state, True)
+    root, below = forward_kinematics(tree, state, True)
     return stack_motions(tree, root, below, state.position[0])
 
 
@@ -201,7 +201,7 @@ def center_of_mass(tree: Tree, state: State) -> Vec:
     Returns:
         x, y and z, `[lanes]` each [m].
     """
-    root, below, _ = forward_kinematics(tree, state, True)
+    root, below = forward_kinematics(tree, state, True)
     core = state.position
 
     def weigh(level: Level, children: Any, moved: tuple[BodyMotion, Any]) -> tuple[Any, Any, Any]:
@@ -240,7 +240,7 @@ def body_poses(
     zero = tuple(xp.zeros_like(columns[:3]))
     still = jax.tree.map(xp.zeros_like, angle)
     state = State(tuple(columns[:3]), tuple(quat), zero, zero, angle, still)
-    root, below, _ = forward_kinematics(tree, state, True)
+    root, below = forward_kinematics(tree, state, True)
     lanes, nbody = len(qpos), len(robot.assembly.parent)
     place: list[Any] = [xp.zeros((lanes, 3), qpos.dtype)] * nbody
     turn: list[Any] = [xp.broadcast_to(xp.eye(3, dtype=qpos.dtype), (lanes, 3, 3))] * nbody

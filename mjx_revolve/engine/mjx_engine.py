@@ -86,6 +86,8 @@ class _Flow(NamedTuple):
         ahead: `[nv]` half a step ahead, for the water's forces and momenta that turn.
         acceleration: `[3]` of the current [m/s²].
         drift: spatial acceleration of each level's bodies when no joint accelerates, `[nbody, 6]`.
+        swing: of each level's bodies, what the turning of the hinges' axes adds to their Jacobians,
+            `[nbody, 6, nv]`; see `dynamics.accelerate`.
     """
 
     qpos: jax.Array
@@ -93,6 +95,7 @@ class _Flow(NamedTuple):
     ahead: jax.Array
     acceleration: jax.Array
     drift: list[jax.Array]
+    swing: list[jax.Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,7 +366,10 @@ def _start(
     # d/dt of J at constant q̇.
     zero = jnp.zeros((), qpos.dtype)
     _, drift = jax.jvp(velocities, (zero,), (zero + 1,))
-    return data, _Flow(qpos, qvel, ahead, acceleration, drift)
+    swing = _swing(plan, model, data, ahead)
+    if plan.tree.carries:
+        drift = [x - y @ qacc_prev for x, y in zip(drift, swing, strict=True)]
+    return data, _Flow(qpos, qvel, ahead, acceleration, drift, swing)
 
 
 def _jacobians(plan: MjxEngine, model: Any, data: Any, level: int) -> tuple[Any, Any]:
@@ -375,6 +381,28 @@ def _jacobians(plan: MjxEngine, model: Any, data: Any, level: int) -> tuple[Any,
         rows.append(jnp.concatenate([turn.T @ angular.T, turn.T @ linear.T]))
         axes.append(turn)
     return jnp.stack(rows), jnp.stack(axes)
+
+
+def _swing(plan: MjxEngine, model: Any, data: Any, ahead: Any) -> list[jax.Array]:
+    """By how much the axes of hinges turn in half a step, as `_Flow.swing`."""
+    levels = [_jacobians(plan, model, data, k) for k in range(len(plan.tree.all))]
+    found = [jnp.zeros_like(jacobian) for jacobian, _ in levels]
+    if not plan.tree.carries:
+        return found
+    places = [data.xpos[jnp.asarray(bodies)] for bodies in plan.tree.bodies]
+    z = jnp.array([0.0, 0.0, 0.5 * plan.dt], ahead.dtype)
+    for level, dofs in enumerate(plan.columns, 1):
+        for k, dof in enumerate(dofs.tolist()):
+            jacobian, turn = (x[k] for x in levels[level])
+            velocity = jacobian @ ahead
+            angular, linear = (turn @ jnp.cross(v, z) for v in (velocity[:3], velocity[3:]))
+            for deeper in range(level, len(levels)):
+                at, axes = places[deeper] - places[level][k], levels[deeper][1]
+                moved = jnp.broadcast_to(angular, at.shape), linear + jnp.cross(angular, at)
+                column = jnp.concatenate([jnp.einsum("bji,bj->bi", axes, x) for x in moved], -1)
+                carried = np.isin(plan.columns[deeper - 1], [dof, *plan.descendants[dof]])
+                found[deeper] = found[deeper].at[:, :, dof].add(carried[:, None] * column)
+    return found
 
 
 def _rigid(plan: MjxEngine, model: Any, data: Any, flow: _Flow) -> _Matrices:
@@ -427,7 +455,7 @@ def _add_water(
     external = with_bed(world, constants, motion, external, water)
     n = constants.count
     wrench = jnp.concatenate([_stack(external.torque, n), _stack(external.force, n)], -1)
-    implicit = []
+    implicit, lacking = [], 0.0
     if external.carried is not None:
         implicit.append(_dense(external.carried, n))
     if external.damping is not None:
@@ -436,18 +464,19 @@ def _add_water(
         rigid, _, momentum = inertia_and_momentum(constants, external, midpoint)
         turning = cross_force(motion.angular_velocity, motion.velocity, *momentum)
         wrench = wrench - jnp.concatenate([_stack(x, n) for x in turning], -1)
-        # The mass matrix holds the rigid inertia; only its J̇ q̇ is missing.
+        # The mass matrix holds the rigid inertia; its J̇ q̇ is missing, and how axes turn.
         wrench = wrench - jnp.einsum("bij,bj->bi", _dense(rigid, n), drift)
+        lacking = jnp.einsum("bik,bij,bjl->kl", jacobian, _dense(rigid, n), flow.swing[level])
         gyro = gyroscope(*momentum)
         rows = [
             jnp.concatenate([_matrix(a, n), _matrix(b, n)], -1)
             for a, b in ((gyro.angular, gyro.across), (gyro.back, gyro.linear))
         ]
         implicit.append(0.5 * dt * jnp.concatenate(rows, -2))
-    mass = matrices.mass
+    mass = matrices.mass + lacking
     for spatial in implicit:
         wrench = wrench - jnp.einsum("bij,bj->bi", spatial, drift)
-        mass = mass + jnp.einsum("bik,bij,bjl->kl", jacobian, spatial, jacobian)
+        mass = mass + jnp.einsum("bik,bij,bjl->kl", jacobian, spatial, jacobian + flow.swing[level])
     found = _Matrices(mass, matrices.force + jnp.einsum("bij,bi->j", jacobian, wrench))
     return found, tuple(x[..., 0] for x in external.submerged)
 
@@ -543,9 +572,9 @@ def _contact_force(model: Any, data: Any, mass: jax.Array, smooth: jax.Array) ->
     drag, friction and servos of the step. So a contact acts against added mass and drag, too, and
     its constraint on the velocity holds at the end of the step.
 
-    Approximated: the gyroscopic part of the matrix is antisymmetric and of the order of dt, so that
-    no minimisation can include it. The solver leaves it out, and the step that applies the force
-    includes it: momentum is conserved, and the constraint is met less exactly. The softness of a
+    Approximated: the part of the matrix that is not symmetric, of the order of dt, can be included
+    by no minimisation. The solver leaves it out, and the step that applies the force includes it:
+    momentum is conserved, and the constraint is met less exactly. The softness of a
     contact (`invweight`) follows from the dry masses. A servo predicts its speed without the
     contact.
 

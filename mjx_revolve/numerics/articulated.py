@@ -88,6 +88,7 @@ class JointElimination(NamedTuple):
 def eliminate_joint(
     block: Block,
     bias: tuple[Vec, Vec],
+    column: tuple[Vec, Vec],
     inertia: Scalar,
     torque: Scalar,
     coriolis: tuple[Vec, Vec],
@@ -98,18 +99,18 @@ def eliminate_joint(
     Args:
         block: articulated inertia of the hinge's body, its descendants included.
         bias: bias force of the same bodies.
+        column: `block` times the body's acceleration per acceleration of the hinge.
         inertia: added about the hinge's axis: armature and implicit terms [kg·m²].
         torque: at the hinge [N·m].
         coriolis: velocity times joint velocity.
-        symmetric: whether `block` is.
+        symmetric: whether `block` is, and the acceleration about z.
 
     Returns:
         Inertia and bias for the parent, and what the pass from root to leaves needs.
     """
-    column_a = tuple(block.angular[i][2] for i in range(3))
-    column_l = tuple(block.back[i][2] for i in range(3))
+    column_a, column_l = column
     row_a, row_l = block.angular[2], block.across[2]
-    inverse = 1 / add(block.angular[2][2], inertia)
+    inverse = 1 / add(column_a[2], inertia)
     rest = sub(torque, bias[0][2])
     scaled_a, scaled_l = vscale(inverse, row_a), vscale(inverse, row_l)
     less = lambda m, column, row: lambda i, j: sub(m[i][j], mul(column[i], row[j]))  # noqa: E731
