@@ -281,9 +281,6 @@ class TaskConfig(Section):
     robust: Annotated[RobustConfig | None, BeforeValidator(_read_robust)] = None
     """`true`, or ranges: coefficients of water and motors are drawn anew in each generation, for
     each trial, the same for all individuals, so that champions do not live on one number."""
-    robust_draws: Literal["independent", "stratified"] = "independent"
-    """`stratified`: of n trials each has another nth of each range of `robust`, so that scores
-    differ less from generation to generation. Searches are no faster by it."""
     measures: TupleOf[Annotated[str, AfterValidator(_check_measure)]] = ()
     """Names of further measures, of `measure_table.MEASURES`."""
     params: Annotated[dict[str, Any], File("data")] = Field({})

@@ -138,20 +138,10 @@ def _draw_course(task: TaskConfig, key: jax.Array) -> Course | None:
 
 
 def _draw_variation(task: TaskConfig, key: jax.Array) -> Variation | None:
-    """Factors within the ranges of `task.robust`, uniformly in their logarithm, `[trials]` each.
-
-    Stratified draws are a Latin hypercube (McKay, Beckman & Conover 1979).
-    """
+    """Factors within the ranges of `task.robust`, uniformly in their logarithm, `[trials]` each."""
     if task.robust is None:
         return None
-    key = jax.random.fold_in(key, 5)
-    if task.robust_draws == "independent":
-        shares = jax.random.uniform(key, (4, task.trials), minval=-1.0)
-    else:
-        rank_key, share_key = jax.random.split(key)
-        ranks = jnp.tile(jnp.arange(task.trials), (4, 1))
-        ranks = jax.random.permutation(rank_key, ranks, axis=1, independent=True)
-        shares = 2 * (ranks + jax.random.uniform(share_key, ranks.shape)) / task.trials - 1
+    shares = jax.random.uniform(jax.random.fold_in(key, 5), (4, task.trials), minval=-1.0)
     ranges = [getattr(task.robust, name) for name in Variation._fields]
     return Variation(*(width**share for width, share in zip(ranges, shares, strict=True)))
 

@@ -25,7 +25,7 @@ FREE_SETTINGS = ("generations", "checkpoint_every", "keep_checkpoints", "tensorb
 _LATER = {
     "task": (
         "measures", "unit", "target_turn", "sight", "touch",
-        "course_spread", "course_changes", "course_turn", "course_rate", "horizon", "robust_draws",
+        "course_spread", "course_changes", "course_turn", "course_rate", "horizon",
     ),
     "controller": ("between",),
 }  # fmt: skip

@@ -76,7 +76,7 @@ def test_defaults(folder):
 ("task.direction=[0, 0, 0]", "task.direction: expected a vector of some length; found"),
 ("task={type: speed, duration: 6, horizon: 3}", "--set task.horizon: expected a time >= "
          "task.duration (6 s); found 3"),
-("task.durtion=5", "--set task.durtion: expected one of 33 keys; found an unknown key; "
+("task.durtion=5", "--set task.durtion: expected one of 32 keys; found an unknown key; "
          "did you mean task.duration?"),
 ("wrld=lake", "found an unknown key; did you mean world?"),
 ("world={density: 1}", "expected a `name` (a world's name or path) beside the overrides"),

@@ -68,19 +68,6 @@ def test_draws_are_the_keys_and_within_their_ranges(settings):
     assert plain.variation is None and Variation._fields == tuple(RobustConfig.model_fields)
 
 
-def test_stratified_draws_share_each_range_out(settings):
-    """Each of n trials has one nth of each range; which one, differs between the ranges."""
-    changes, orders = {"task.trials": 5, "task.robust_draws": "stratified"}, set()
-    fitness = make_fitness(settings, **changes)
-    for seed in range(8):
-        drawn = fitness.draw_starts(jax.random.key(seed)).variation._asdict()
-        shares = [np.log(np.asarray(x)) / np.log(WIDE[name]) for name, x in drawn.items()]
-        parts = np.floor((np.stack(shares) + 1) / 2 * 5).astype(int)
-        np.testing.assert_array_equal(np.sort(parts), np.tile(np.arange(5), (4, 1)))
-        orders |= set(map(tuple, parts))
-    assert len(orders) > 24
-
-
 @pytest.mark.long
 def test_one_body_and_many_and_its_replay(settings):
     """The same scores from both programs, and from the trajectory of each trial."""
