@@ -92,10 +92,10 @@ def accelerate(
     body with many times its mass of water until it blows up. h itself is extrapolated to the
     middle from the step before, for second order.
 
-    A hinge's axis z turns with its body, too. The body's acceleration from the hinge, z q̈ + ν × z q̇,
-    takes ν × z from the step before as well, and q̇ in the step's middle from the acceleration that
-    is sought: (z + dt/2 ν × z) q̈ + ν × z q̇. What jumps in a step is the hinge's acceleration, as a
-    servo begins to push or a stop holds it.
+    The Coriolis acceleration ν × z q̇ of a body by its hinge takes q̇ in the middle, too, with the q̈
+    that is sought: the hinge moves its body by (z + dt/2 ν × z) q̈ + ν × z q̇. For a mass that goes
+    straight while its hinge turns it, that cancels the turning of its momentum; with the q̈ of the
+    step before it would not where servos begin to push or a stop holds them.
 
     Args:
         tree: the robots.
