@@ -455,7 +455,8 @@ def _add_water(
     external = with_bed(world, constants, motion, external, water)
     n = constants.count
     wrench = jnp.concatenate([_stack(external.torque, n), _stack(external.force, n)], -1)
-    implicit, lacking = [], 0.0
+    implicit: list[jax.Array] = []
+    lacking: Any = 0.0
     if external.carried is not None:
         implicit.append(_dense(external.carried, n))
     if external.damping is not None:
