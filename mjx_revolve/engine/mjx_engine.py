@@ -87,7 +87,7 @@ class _Flow(NamedTuple):
         acceleration: `[3]` of the current [m/s²].
         drift: spatial acceleration of each level's bodies when no joint accelerates, `[nbody, 6]`.
         swing: of each level's bodies, what the turning of the hinges' axes adds to their Jacobians,
-            `[nbody, 6, nv]`; see `dynamics.accelerate`.
+            `[nbody, 6, nv]`, or a zero without carried water; see `dynamics.accelerate`.
     """
 
     qpos: jax.Array
@@ -366,8 +366,9 @@ def _start(
     # d/dt of J at constant q̇.
     zero = jnp.zeros((), qpos.dtype)
     _, drift = jax.jvp(velocities, (zero,), (zero + 1,))
-    swing = _swing(plan, model, data, ahead)
+    swing = [zero] * len(drift)
     if plan.tree.carries:
+        swing = _swing(plan, model, data, ahead)
         drift = [x - y @ qacc_prev for x, y in zip(drift, swing, strict=True)]
     return data, _Flow(qpos, qvel, ahead, acceleration, drift, swing)
 
@@ -385,24 +386,9 @@ def _jacobians(plan: MjxEngine, model: Any, data: Any, level: int) -> tuple[Any,
 
 def _swing(plan: MjxEngine, model: Any, data: Any, ahead: Any) -> list[jax.Array]:
     """By how much the axes of hinges turn in half a step, as `_Flow.swing`."""
-    levels = [_jacobians(plan, model, data, k) for k in range(len(plan.tree.all))]
-    found = [jnp.zeros_like(jacobian) for jacobian, _ in levels]
-    if not plan.tree.carries:
-        return found
-    places = [data.xpos[jnp.asarray(bodies)] for bodies in plan.tree.bodies]
-    z = jnp.array([0.0, 0.0, 0.5 * plan.dt], ahead.dtype)
-    for level, dofs in enumerate(plan.columns, 1):
-        for k, dof in enumerate(dofs.tolist()):
-            jacobian, turn = (x[k] for x in levels[level])
-            velocity = jacobian @ ahead
-            angular, linear = (turn @ jnp.cross(v, z) for v in (velocity[:3], velocity[3:]))
-            for deeper in range(level, len(levels)):
-                at, axes = places[deeper] - places[level][k], levels[deeper][1]
-                moved = jnp.broadcast_to(angular, at.shape), linear + jnp.cross(angular, at)
-                column = jnp.concatenate([jnp.einsum("bji,bj->bi", axes, x) for x in moved], -1)
-                carried = np.isin(plan.columns[deeper - 1], [dof, *plan.descendants[dof]])
-                found[deeper] = found[deeper].at[:, :, dof].add(carried[:, None] * column)
-    return found
+    turned = mjx.com_vel(model, data.replace(qvel=ahead)).cdof_dot.at[:6].set(0)
+    rates = data.replace(cdof=0.5 * plan.dt * turned)
+    return [_jacobians(plan, model, rates, k)[0] for k in range(len(plan.tree.all))]
 
 
 def _rigid(plan: MjxEngine, model: Any, data: Any, flow: _Flow) -> _Matrices:
