@@ -161,17 +161,9 @@ body:
   id: core
   type: Core
   children:
-    1:
-      id: shoulder
-      type: ActiveHinge
-      orientation: 90
-      children:
-        1:
-          id: upper
-          type: FixedBrick
-          orientation: -90
-          children:
-            1: {id: wrist, type: ActiveHinge, children: {1: {id: hand, type: FixedBrick}}}
+    1: {id: shoulder, type: ActiveHinge, orientation: 90, children: {1: {
+          id: upper, type: FixedBrick, orientation: -90, children: {1: {
+            id: wrist, type: ActiveHinge, children: {1: {id: hand, type: FixedBrick}}}}}}}
     2: {id: tail, type: ActiveHinge, children: {1: {id: tip, type: ActiveHinge, orientation: 90}}}
 """
 _ELBOW = """
@@ -180,16 +172,9 @@ body:
   id: core
   type: Core
   children:
-    1:
-      id: shoulder
-      type: ActiveHinge
-      orientation: 90
-      children:
-        1:
-          id: upper
-          type: FixedBrick
-          children:
-            2: {id: wrist, type: ActiveHinge, orientation: 180, children: {1: {type: FixedBrick}}}
+    1: {id: shoulder, type: ActiveHinge, orientation: 90, children: {1: {
+          id: upper, type: FixedBrick, children: {2: {
+            id: wrist, type: ActiveHinge, orientation: 180, children: {1: {type: FixedBrick}}}}}}}
 """
 
 
