@@ -40,6 +40,7 @@ _MARGIN = 6  # [pixels]
 # A sheet: most bodies, columns, and sizes [inches].
 _MAX_SHOWN, _COLUMNS, _WIDTH, _HEIGHT, _TOP = 12, 4, 2.2, 2.0, 0.5
 _PANELS = 8  # most descriptors that are drawn over the generations
+_IN_LINE = 5  # most champions beside each other: as many as a study has seeds by default
 # These first, where they differ; counts of modules of a kind that no body has are left out.
 _FIRST = (
     "num_modules", "num_hinges", "length", "mass", "symmetry", "proportion", "limbs", "branching",
@@ -122,7 +123,7 @@ def count_modules(life: LoggedIndividual) -> str:
 def plot_bodies(
     cases: Mapping[str, Sequence[Outcome]], numbers: Sequence[int] | None = None
 ) -> Figure:
-    """Draws the champions at rest, with scores and lengths, in one scale: a line for each case.
+    """Draws the champions at rest, with scores and lengths, in one scale: lines for each case.
 
     Args:
         cases: outcomes by case, all with bodies.
@@ -134,15 +135,18 @@ def plot_bodies(
     bodies = {name: [(o, o.body) for o in case if o.body is not None]
               for name, case in cases.items()}  # fmt: skip
     pictures = iter(draw_bodies([body for case in bodies.values() for _, body in case]))
-    columns = max(map(len, bodies.values()))
-    figure = new_figure(WIDE, (WIDE / columns * SIZE[1] / SIZE[0] + 0.25) * len(bodies))
-    grid = figure.subplots(len(bodies), columns, squeeze=False)
+    columns = min(_IN_LINE, max(map(len, bodies.values())))
+    lines = [
+        (k, name, case[first : first + columns])
+        for k, (name, case) in zip(numbers or range(len(bodies)), bodies.items(), strict=True)
+        for first in range(0, len(case), columns)
+    ]
+    figure = new_figure(WIDE, (WIDE / columns * SIZE[1] / SIZE[0] + 0.25) * len(lines))
+    grid = figure.subplots(len(lines), columns, squeeze=False)
     for axes in grid.flat:
         axes.set_axis_off()
-    for k, line, (name, case) in zip(
-        numbers or range(len(bodies)), grid, bodies.items(), strict=True
-    ):
-        for axes, (outcome, body) in zip(line, case, strict=False):
+    for line, (k, name, some) in zip(grid, lines, strict=True):
+        for axes, (outcome, body) in zip(line, some, strict=False):
             _show(axes, next(pictures))
             length = 100 * body.descriptors["length"]
             words = f"seed {outcome.plan.seed}: {outcome.champion['score']:.3g}, {length:.0f} cm"
