@@ -13,6 +13,7 @@ from laboratory import ROOT
 from mjx_revolve.evolution.run_folder import RunFolder
 from mjx_revolve.evolution.sweeps import Plan
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.body_pictures import plot_bodies
 from mjx_revolve.view.outcomes import Outcome, by_case
 from toys import CLOCK, make_toy_bodies
 
@@ -159,6 +160,15 @@ def outcomes(values):
             plan = Plan(case, seed, ROOT / case / f"seed_{seed}", studies.BASE, ())
             found.append(Outcome(plan, figures, figures, curve | {"seconds": np.ones(2)}, one))
     return found
+
+
+def test_champions_of_many_seeds_take_further_lines():
+    cases = by_case(outcomes({"open_water": range(7), "shore": range(2)}), ENVIRONMENTS)
+    figure = plot_bodies(cases)
+    titles = [axes.get_title().partition(":")[0] for axes in figure.axes]
+    assert titles == [
+        *(f"seed {k}" for k in range(7)), *[""] * 3, "seed 0", "seed 1", *[""] * 3,
+    ]  # fmt: skip
 
 
 def test_a_difference_is_said_only_where_the_tests_bear_it():
