@@ -8,7 +8,7 @@ on when it is started again; see `studies.py`. What all runs share stands in `st
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -91,10 +91,10 @@ def write_report(folder: Path, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """
     known = make_cases()
     cases = by_case(outcomes, known)
-    scores = {name: [o.champion["score"] for o in found] for name, found in cases.items()}
-    ours = scores.get("coevolution", [])
-    others = [name for name in cases if ours and name != "coevolution"]
-    p = holm([rank_test(ours, scores[name]) for name in others])
+    scores, swum = (
+        {name: [o.champion[figure] for o in found] for name, found in cases.items()}
+        for figure in ("score", "swum_score")
+    )
     fastest = max(outcomes, key=lambda o: o.champion["score"])
     figure = new_figure(WIDE + 3, 4.4)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
@@ -108,14 +108,26 @@ def write_report(folder: Path, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     write_csv(folder / "budgets.csv", rows)
     return {
         "runs": describe_runs(cases, known),
-        "differences": [
-            {"name": name, "difference": as_numbers(difference(ours, scores[name])), "p": value}
-            for name, value in zip(others, p, strict=True)
-        ],
+        "differences": _compare(scores),
+        "swum_differences": _compare(swum),
         "fastest": {
             "score": fastest.champion["score"], "name": fastest.plan.case, "seed": fastest.plan.seed
         },
     }  # fmt: skip
+
+
+def _compare(scores: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
+    """Co-evolution's scores beside those of each other case."""
+    others = [name for name in scores if "coevolution" in scores and name != "coevolution"]
+    p = holm([rank_test(scores["coevolution"], scores[name]) for name in others])
+    return [
+        {
+            "name": name,
+            "difference": as_numbers(difference(scores["coevolution"], scores[name])),
+            "p": value,
+        }
+        for name, value in zip(others, p, strict=True)
+    ]
 
 
 def main(argv: list[str] | None = None) -> int:

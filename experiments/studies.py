@@ -17,6 +17,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from experiments.common import as_numbers, make_folder, make_parser, write_results
+from mjx_revolve.episodes.config import Config
+from mjx_revolve.episodes.run_reader import RunReader
 from mjx_revolve.evolution.executor import make_executor
 from mjx_revolve.evolution.generations import Champion
 from mjx_revolve.evolution.run import Run
@@ -33,7 +35,7 @@ from mjx_revolve.view.statistics import interval
 
 BASE = Path(__file__).with_name("studies.yaml")
 MAKE_FITNESS = None  # the real one; see `executor.make_executor`
-_STILL_KEY, _STARTS = 20_000, 8  # of the starts from which champions are scored at rest; a choice
+_KEY, _STARTS = 20_000, 8  # of the starts from which champions are judged; a choice
 
 
 class Case(NamedTuple):
@@ -106,7 +108,7 @@ def study_main(
     folder, plans = make_plans(make_cases(given_settings(options)), options, name)
     if not options.report and (code := run_study(plans, name, argv)):
         return code
-    outcomes = score_still(read_outcomes(plans, add))
+    outcomes = judge_champions(read_outcomes(plans, add))
     numbers = write_report(folder, outcomes)
     for run in numbers["runs"]:
         print(f"{run['name']}: {run['score']['text']} body lengths/s, {run['seeds']} seeds")
@@ -199,31 +201,37 @@ def read_outcomes(
     return found
 
 
-def score_still(outcomes: Sequence[Outcome]) -> list[Outcome]:
-    """Scores the champions once more with all joints at rest.
+def judge_champions(outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """Scores the champions as they were not selected: with all joints at rest, and for longer.
 
     A body that starts in another attitude than that in which it hangs in the water turns, and its
-    core moves; what it scores by that is not swimming.
+    core moves; what it scores by that is not swimming. A score that is extrapolated to a horizon
+    (`task.horizon`) supposes that a robot goes on turning as it did; to swim as long shows it.
 
     Args:
         outcomes: of the finished runs.
 
     Returns:
-        The same with `still_score` among the champions' figures: the mean over a few fresh starts.
+        The same with `still_score` and `swum_score` among the champions' figures, means over a few
+        fresh starts; without a horizon the second is over the task's own time.
     """
     prepare_process()
     found = []
     for some in by_case(outcomes, dict.fromkeys(o.plan.case for o in outcomes)).values():
-        scores = _still_scores(some)
+        config = some[0].plan.config
+        seconds = config.task.horizon or config.task.duration
+        task = config.task.model_copy(update={"duration": seconds, "horizon": None})
+        still = _champion_scores(config, some, 0.0)
+        swum = _champion_scores(config.model_copy(update={"task": task}), some, 1.0)
         found += [
-            o._replace(champion={**o.champion, "still_score": score})
-            for o, score in zip(some, scores.tolist(), strict=True)
+            o._replace(champion={**o.champion, "still_score": a, "swum_score": b})
+            for o, a, b in zip(some, still.tolist(), swum.tolist(), strict=True)
         ]
     return found
 
 
-def _still_scores(outcomes: Sequence[Outcome]) -> np.ndarray:
-    """`[n]` of one case, by the program that its runs had."""
+def _champion_scores(config: Config, outcomes: Sequence[Outcome], share: float) -> np.ndarray:
+    """`[n]` of one case, with a share of each champion's genes."""
     import jax
 
     from mjx_revolve.episodes.fitness import make_fitness
@@ -232,18 +240,19 @@ def _still_scores(outcomes: Sequence[Outcome]) -> np.ndarray:
     from mjx_revolve.evolution.individuals import Individual
     from mjx_revolve.evolution.learning import score_brains
 
-    config = outcomes[0].plan.config
-    keys = jax.random.split(jax.random.key(_STILL_KEY), _STARTS)
+    keys = jax.random.split(jax.random.key(_KEY), _STARTS)
+    make = MAKE_FITNESS or (make_fitness if config.bodies is None else make_body_fitness)
+    fitness = make(config)
+    genes = [share * RunReader(o.plan.folder).load_champion().genes for o in outcomes]
     if config.bodies is None:
-        fitness = make_fitness(config)
-        still = np.zeros((config.evolution.population_size, fitness.num_genes), np.float32)
-        score = np.mean([fitness.evaluate(still, key)[0][0] for key in keys])
-        return np.full(len(outcomes), score)
-    bodies = make_body_fitness(config)
-    executor = Executor(bodies, bodies.block_size)
-    who = [Individual(k, (), 0, "champion", None, o.body, None) for k, o in enumerate(outcomes)]
-    genes = [np.zeros((1, bodies.num_genes), np.float32)] * len(who)
-    return np.mean([[s[0] for s, _ in score_brains(executor, who, genes, key)] for key in keys], 0)
+        brains = np.array(genes, np.float32)
+        return np.mean([fitness.evaluate(brains, key)[0] for key in keys], 0)
+    executor = Executor(fitness, fitness.block_size)
+    some = [Individual(k, (), 0, "champion", None, o.body, None) for k, o in enumerate(outcomes)]
+    rows = [np.zeros((1, fitness.num_genes), np.float32) for _ in some]
+    for row, own, one in zip(rows, genes, some, strict=True):
+        row[0, fitness.layout(one.body).columns] = own
+    return np.mean([[s[0] for s, _ in score_brains(executor, some, rows, key)] for key in keys], 0)
 
 
 def describe_runs(
@@ -267,7 +276,7 @@ def describe_runs(
             "seconds": float(np.mean([o.metrics["seconds"][-1] for o in outcomes])),
             **{
                 figure: as_numbers(interval([o.champion.get(figure, np.nan) for o in outcomes]))
-                for figure in ("score", "still_score", "speed_m_s")
+                for figure in ("score", "swum_score", "still_score", "speed_m_s")
             },
         }
         for name, outcomes in cases.items()
