@@ -136,6 +136,17 @@ def test_a_run_that_lacks_only_its_champion(folder):
     assert contents(folder / "run") == before
 
 
+def test_a_run_that_has_lost_its_checkpoints_does_not_begin_anew(folder, capsys):
+    assert run_main("toy.yaml", "--out", "run") == 0
+    before = (folder / "run" / "metrics.csv").read_text()
+    shutil.rmtree(folder / "run" / "checkpoints")
+    assert run_main("--resume", "run", "--set", "evolution.generations=9") == 2
+    assert "checkpoints: expected a checkpoint to resume from; found none" in (
+        capsys.readouterr().err
+    )
+    assert (folder / "run" / "metrics.csv").read_text() == before
+
+
 def test_resuming_remembers_the_settings(folder):
     assert run_main("toy.yaml", "--out", "run", "--seed", 3, "--set", "task.trials=3") == 0
     more = ("--set", "evolution.generations=8")

@@ -19,6 +19,7 @@ from mjx_revolve.episodes.passport import Passport
 from mjx_revolve.episodes.scoring import REPORT_EPISODES, REPORT_STREAM, replay_key
 from mjx_revolve.evolution.blocks import Scored
 from mjx_revolve.evolution.strategies import FAILED_SCORE
+from mjx_revolve.inputs.errors import InputError
 
 # Fresh episodes per candidate to choose the champion. The reported score comes from others
 # (`REPORT_EPISODES`), because the best of several means is biased upwards, too.
@@ -210,6 +211,9 @@ def choose_candidate(
 
     Returns:
         The winner's index, and `score`, `std`, `measures`, `key` and `passport` of its `Champion`.
+
+    Raises:
+        InputError: no candidate has a finite score from any start.
     """
     root = jax.random.key(seed)
 
@@ -223,6 +227,8 @@ def choose_candidate(
 
     means = fresh(range(len(eligible)), CHOOSE_STREAM, CHOOSE_EPISODES)[0].mean(axis=0)
     order = np.argsort(-np.where(eligible, means, -np.inf), kind="stable")
+    if not np.any(means[eligible] > FAILED_SCORE):
+        raise InputError("champion: expected a score of any candidate; found none: all failed")
     winner, passport = int(order[0]), None
     if judge is not None:
         first = [int(k) for k in order[:_TRIED] if eligible[k] and means[k] > FAILED_SCORE]

@@ -193,7 +193,9 @@ class Run:
         config = old.model_copy(update={"evolution": old.evolution.model_copy(update=free)})
         if config.evolution.tensorboard:
             check_tensorboard(label)
-        checkpoint = files.load_checkpoint() if files.checkpoints() else None
+        # A champion is written after a checkpoint: where there is one, all of them are lost.
+        saved = files.checkpoints() or files.champion_path
+        checkpoint = files.load_checkpoint() if saved else None
         for name in checkpoint.damaged if checkpoint else ():
             _log.warning("passed over a damaged checkpoint: %s", name)
         begun = checkpoint.meta if checkpoint else files.info

@@ -247,6 +247,8 @@ def test_doing_nothing_is_a_candidate():
     # Of equal ones, what has evolved wins.
     champion = choose_champion(config, Broken(lambda rows: rows >= 0, 1.0), search)
     assert champion.origin.startswith("best of generation")
+    with pytest.raises(InputError, match=r"champion: expected a score .+; found none: all failed"):
+        choose_champion(config, Broken(lambda rows: rows >= 0, np.nan), search)
 
 
 def test_where_a_passport_is_required_the_first_that_passes_becomes_the_champion(monkeypatch):
