@@ -64,6 +64,8 @@ def _help() -> str:
     """All commands, examples, and what comes with the package."""
     configs = {name: _first_words(path) for name, path in list_shipped("configs").items()}
     robots = ", ".join(list_shipped("morphologies"))
+    folder = Path(__file__).with_name("water") / "worlds"
+    worlds = ", ".join(sorted(path.stem for path in folder.glob("*.yaml")))
     return "\n".join((
         f"usage: {program('COMMAND')} ...",
         "",
@@ -79,6 +81,8 @@ def _help() -> str:
         *_columns(configs),
         "",
         _fill(f"robots: {robots}", 2),
+        "",
+        f"worlds: {worlds}",
         "",
         "--version prints the version.",
     ))  # fmt: skip

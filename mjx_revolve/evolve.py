@@ -244,18 +244,20 @@ def _describe(run: Run) -> str:
         device += f", {executor.num_workers} workers"
     return (
         f"{body}{executor.num_genes} genes | {config.subject} | "
-        f"{_search_name(config)} {evolution.population_size} x {evolution.generations}, "
-        f"seed {evolution.seed} | {device} | {short_path(run.folder.path)}"
+        f"{_search_words(config)}, seed {evolution.seed} | {device} | {short_path(run.folder.path)}"
     )
 
 
-def _search_name(config: Config) -> str:
-    """How it is searched."""
+def _search_words(config: Config) -> str:
+    """How it is searched, and for how long."""
+    size, generations = config.evolution.population_size, config.evolution.generations
+    if config.colony is not None:
+        return f"at most {size} robots, {generations} intervals"
     if config.bodies is None:
-        return config.evolution.strategy
+        return f"{config.evolution.strategy} {size} x {generations}"
     selection, learning = config.bodies.selection, config.bodies.learning
     learns = f", {learning.trials} trials a life" if learning.trials > 1 else ""
-    return f"{selection.type}{learns},"
+    return f"{selection.type}{learns}, {size} x {generations}"
 
 
 def _resume_hint(run: Run) -> str:

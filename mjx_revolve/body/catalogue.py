@@ -310,8 +310,8 @@ def load_modules(path: str | Path) -> dict[str, ModuleType]:
                 ballast_position: [0, 0, 0]       # default; of both
                 entrained_water: 0.0              # default; share of the free volume, 0 to 1
                 buoyancy: partial                 # or mask, off; default: the world's
-                drag: lift_drag                   # or faces, ellipsoid, off; default: the world's,
-                                                  # of a fin lift_drag
+                drag: lift_drag                   # or another law of docs/physics.md, or off;
+                                                  # default: the world's, of a fin lift_drag
                 added_mass: true                  # default: the world's
                 coefficients: {}                  # default; of laws, by name
                 drag_coefficient: 1.05            # default; or three, along the part's axes

@@ -89,7 +89,8 @@ class ModuleSites:
         if where == "at":
             names = [module.name for module in modules]
             if name not in names:
-                raise InputError(f"expected the id of a module; found {show(name)}")
+                known = ", ".join(names)
+                raise InputError(f"expected the id of a module; found {show(name)}, of {known}")
             k = names.index(name)
             row = self._row(int(bodies[k]))
             turn = tuple(tuple(x) for x in rotation[k].tolist())

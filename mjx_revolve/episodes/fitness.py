@@ -745,4 +745,9 @@ def _find_controller(
 ) -> Controller:
     if settings.depth is None:
         settings = settings.model_copy(update={"depth": config.task.depth})
-    return find_controller(plant, settings, config.source, example, body)
+    try:
+        return find_controller(plant, settings, config.source, example, body)
+    except InputError as error:
+        if config.controller.sensors is None or not str(error).startswith("sensors."):
+            raise
+        raise config.blame(InputError(f"controller.{error}")) from None

@@ -417,13 +417,21 @@ def find_task(settings: TaskConfig, source: str = "config") -> Task:
         task = replace(task, score=partial(_score_in_metres, task.score), unit=unit)
     if name in TASKS:
         return task
-    found = call_user_function(
-        name,
-        f"{short_name(name)} to score a track",
-        jax.eval_shape,
-        lambda track: task.score(track, settings),
-        _example_track(task.records),
-    )
+    try:
+        found = call_user_function(
+            name,
+            f"{short_name(name)} to score a track",
+            jax.eval_shape,
+            lambda track: task.score(track, settings),
+            _example_track(task.records),
+        )
+    except InputError as error:
+        if "NoneType" not in str(error):
+            raise
+        hint = (
+            'what it reads of joints, forces and more it records: Task(score, records=("joints",))'
+        )
+        raise InputError(f"{error}; {hint}") from None
     if not isinstance(found, jax.ShapeDtypeStruct) or found.shape != (_LANES,):
         own = parse_user_function(name)
         assert own is not None

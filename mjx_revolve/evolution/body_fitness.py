@@ -215,7 +215,7 @@ def _load_seed(
     body = load_morphology(path, modules, config.allow_overlap)
     reason = space.refuses(body)
     if reason:
-        raise InputError(f"{path}: {reason}")
+        raise InputError(f"bodies.seeds: {path}: {reason}")
     return body
 
 

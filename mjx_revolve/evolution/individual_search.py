@@ -92,7 +92,8 @@ class IndividualEvolution:
         return self._champion(candidates[winner], **judged)
 
     def _champion(self, one: Individual, **judged: Any) -> Champion:
-        origin = f"individual {one.number} of generation {one.born}, {one.origin}"
+        unit = "generation" if self.config.colony is None else "interval"
+        origin = f"individual {one.number} of {unit} {one.born}, {one.origin}"
         genes = np.array(one.genes, np.float32)
         return Champion(genes=genes, origin=origin, body=one.body, individual=one.number, **judged)
 

@@ -177,7 +177,8 @@ class Progress:
 
     def _figures(self, row: Mapping[str, float]) -> list[str]:
         """What is shown of a row."""
-        figures = {"best": f"{row['best']:.4g}", "mean": f"{row['mean']:.4g}"}
+        # A colony's robots have no fitness before they are some age.
+        figures = {x: "-" if row[x] != row[x] else f"{row[x]:.4g}" for x in ("best", "mean")}
         rate = row["evaluations_per_second"]
         speed = "evaluations/s", f"{rate:.0f}" if rate >= 1000 else f"{rate:.4g}"
         if "times_real_time" in row:

@@ -68,13 +68,13 @@ def check_name(path: str | Path, endings: Sequence[str], label: str | None = Non
         InputError: it has none of the suffixes, or is a folder.
     """
     path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{label or path}: expected a file; found a folder")
     if path.suffix.lower() not in endings:
         raise InputError(
             f"{label or path}: expected a name that ends in {' or '.join(endings)}; found "
             f"{path.suffix!r}"
         )
-    if path.is_dir():
-        raise InputError(f"{label or path}: expected a file; found a folder")
     return path
 
 
