@@ -52,8 +52,6 @@ format: $(READY)  ## let ruff mend what it can
 docs: $(READY)  ## the site in build/docs: pages, reference, gallery; minutes
 	$(RUN) docs/settings.py
 	$(RUN) docs/figures.py
-	for kind in config modules morphology sweep world; do \
-	  $(RUN) -m mjx_revolve schema $$kind > mjx_revolve/schemas/$$kind.json || exit 1; done
 	rm -rf build/docs
 	$(RUN) docs/gallery.py build/docs
 	$(RUN) docs/reference.py build/docs

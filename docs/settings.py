@@ -1,8 +1,8 @@
-"""Writes docs/settings.md: every task, controller and setting, from the code that reads them.
+"""Writes docs/settings.md, every task, controller and setting, and the schemas of YAML files.
 
     python docs/settings.py
 
-A test compares the page with what this would write, so that it cannot go stale.
+Both from the code that reads them; tests compare them, so that they cannot go stale.
 """
 
 from __future__ import annotations
@@ -18,11 +18,13 @@ from typing import Annotated, Any
 
 from pydantic_core import PydanticUndefined
 
+from mjx_revolve import schema
 from mjx_revolve.control.table import CONTROLLERS
 from mjx_revolve.episodes import config as settings
 from mjx_revolve.episodes.tasks import TASKS
 from mjx_revolve.evolution.strategies import STRATEGIES
 from mjx_revolve.inputs.validation_messages import describe, fields_of
+from mjx_revolve.schema import KINDS, show_schema
 from mjx_revolve.water.bed import Bed
 from mjx_revolve.water.buoyancy import BUOYANCY_LAWS
 from mjx_revolve.water.currents import Gust, Shear, Wave
@@ -32,6 +34,7 @@ from mjx_revolve.water.plates import Fossen, LiftDrag
 from mjx_revolve.water.world import SurfaceTension, World
 
 PAGE = Path(__file__).with_name("settings.md")
+SCHEMAS = Path(schema.__file__).with_name("schemas")
 # The parts of a world that are mappings of their own.
 _PARTS: dict[str, type] = {
     "bed": Bed, "gust": Gust, "shear": Shear, "waves": Wave, "lift_drag": LiftDrag,
@@ -169,4 +172,6 @@ def make_page() -> str:
 
 if __name__ == "__main__":
     PAGE.write_text(make_page(), encoding="utf-8")
+    for kind in KINDS:
+        SCHEMAS.joinpath(f"{kind}.json").write_text(show_schema(kind), encoding="utf-8")
     sys.exit(0)
