@@ -8,15 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import (
-    WATER,
-    at_rest,
-    body,
-    elbow_robot,
-    march,
-    read,
-    world,
-)
+from laboratory import WATER, at_rest, body, elbow_robot, march, read, world
 from mjx_revolve.control.cpg import make_cpg
 from mjx_revolve.control.gait import describe_gait
 from mjx_revolve.control.readings import SensorReadings

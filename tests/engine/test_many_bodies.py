@@ -17,12 +17,7 @@ from laboratory import QUICK, ROOT, WATER, accelerate, body, random_states, read
 from mjx_revolve import MODULES, load_config, load_morphology, make_fitness, make_mixed_fitness
 from mjx_revolve.body.edits import add_module
 from mjx_revolve.control.controller import gene_indices
-from mjx_revolve.engine.batch import (
-    PartGroup,
-    fit_capacity,
-    order_rows,
-    pack_bodies,
-)
+from mjx_revolve.engine.batch import PartGroup, fit_capacity, order_rows, pack_bodies
 from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.population import acceleration
 from mjx_revolve.engine.robot import build_robot

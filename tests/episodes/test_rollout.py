@@ -8,17 +8,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from laboratory import (
-    QUICK,
-    SLOPE,
-    WATER,
-    body,
-    elbow_robot,
-    march,
-    oar_robot,
-    read,
-    world,
-)
+from laboratory import QUICK, SLOPE, WATER, body, elbow_robot, march, oar_robot, read, world
 from mjx_revolve.body.morphology import trim_neutral
 from mjx_revolve.control.controller import bind_genes
 from mjx_revolve.control.cpg import make_cpg

@@ -377,13 +377,19 @@ def start(folder, *argv, **environment):
 LONG = ("toy.yaml", "--out", "run", "--workers", 2, "--set", "evolution.generations=5000")
 
 
-@pytest.mark.slow
-@needs_proc
-def test_ctrl_c_finishes_the_generation(folder):
+def start_long(folder):
+    """A run with two workers, past its first generation."""
     process = start(folder, *LONG)
     toys.read_until(process, "generation 1/")
     workers = workers_of(process.pid)
     assert len(workers) == 2
+    return process, workers
+
+
+@pytest.mark.slow
+@needs_proc
+def test_ctrl_c_finishes_the_generation(folder):
+    process, workers = start_long(folder)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does
     out, _ = process.communicate(timeout=120)
     assert process.returncode == 130, out
@@ -400,10 +406,7 @@ def test_ctrl_c_finishes_the_generation(folder):
 @pytest.mark.slow
 @needs_proc
 def test_workers_do_not_outlive_their_leader(folder):
-    process = start(folder, *LONG)
-    toys.read_until(process, "generation 1/")
-    workers = workers_of(process.pid)
-    assert len(workers) == 2
+    process, workers = start_long(folder)
     os.kill(workers[0], signal.SIGSTOP)  # it is not asked
     process.kill()
     process.communicate(timeout=120)

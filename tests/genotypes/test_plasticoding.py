@@ -7,12 +7,7 @@ from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.genotypes.genotype import Space
 from mjx_revolve.genotypes.kinds import find_genotype
-from mjx_revolve.genotypes.plasticoding import (
-    Grammar,
-    draw_sentence,
-    expand,
-    make_alphabet,
-)
+from mjx_revolve.genotypes.plasticoding import Grammar, draw_sentence, expand, make_alphabet
 
 ALL = ("FixedBrick", "ActiveHinge", "TouchSensor", "Fin", "Thruster", "LiftThruster")
 SPACE = Space(MODULES, ALL, "Core", 1, 20, 0, 10)

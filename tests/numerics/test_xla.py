@@ -10,13 +10,7 @@ import pytest
 
 from mjx_revolve.numerics import xla
 from mjx_revolve.numerics.adjoint import differentiate_as
-from mjx_revolve.numerics.xla import (
-    fuse,
-    fuse_outermost,
-    fuse_step,
-    on_cpu,
-    over_chunks,
-)
+from mjx_revolve.numerics.xla import fuse, fuse_outermost, fuse_step, on_cpu, over_chunks
 
 LANES = jnp.linspace(-1, 1, 64, dtype=jnp.float32)
 

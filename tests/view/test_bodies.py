@@ -12,11 +12,7 @@ from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.episodes import champion as champions
 from mjx_revolve.episodes.individual_log import read_generations, read_individuals
 from mjx_revolve.view.body_pictures import SIZE, draw_bodies
-from mjx_revolve.view.population import (
-    pick_ancestors,
-    read_population,
-    trace_lineage,
-)
+from mjx_revolve.view.population import pick_ancestors, read_population, trace_lineage
 from mjx_revolve.view.report import bodies as report_bodies
 from mjx_revolve.view.report import page as report_page
 from mjx_revolve.view.report.data import read_run

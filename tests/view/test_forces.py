@@ -4,14 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import (
-    accelerate,
-    arm_robot,
-    box_robot,
-    face_drag,
-    random_states,
-    world,
-)
+from laboratory import accelerate, arm_robot, box_robot, face_drag, random_states, world
 from mjx_revolve.body.module_types import Thruster
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.simulate import Trajectory

@@ -4,16 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import (
-    accelerate,
-    arm_robot,
-    at_rest,
-    body,
-    box_robot,
-    march,
-    random_states,
-    world,
-)
+from laboratory import accelerate, arm_robot, at_rest, body, box_robot, march, random_states, world
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.water.added_mass import box_added_mass, lamb_coefficients
 from references import Lagrangian

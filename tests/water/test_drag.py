@@ -16,9 +16,7 @@ from laboratory import (
     world,
 )
 from mjx_revolve.water.face_drag import face_drag_coefficients
-from mjx_revolve.water.mujoco_drag import (
-    inertia_box,
-)
+from mjx_revolve.water.mujoco_drag import inertia_box
 
 RHO = 999.1026
 G = 9.81

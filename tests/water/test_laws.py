@@ -34,6 +34,7 @@ from mjx_revolve.water.laws import (
     part_field,
     part_fields,
 )
+from mjx_revolve.water.world import World
 
 NUMBERS = (Parts, CarriedWater)
 
@@ -128,7 +129,8 @@ class LinearNumbers:
     linear: Any = part_field("N s/m", axes="size", varied=("drag",))
 
 
-def linear_drag(flow, numbers, world):
+def linear_drag(flow: PartFlow, numbers: LinearNumbers, world: World) -> Drag:
+    """A force against the velocity, with its gradient as damping."""
     damping = [mul(c, flow.submerged) for c in numbers.linear]
     force = tuple(-d * v for d, v in zip(damping, flow.velocity, strict=True))
     return Drag(force, (0.0, 0.0, 0.0), tuple(damping))
