@@ -148,6 +148,8 @@ def _make(
         raise InputError(
             f"{source}: expected a mapping with id, body and brain; found {show(data)}"
         )
+    if "task" in data and "body" not in data:
+        raise InputError(f"{source}: expected a robot; found a configuration")
     _check_known(data, ("id", "body", "sensors", "brain", "coefficients"), source)
     if "body" not in data:
         raise InputError(f"{source}: expected the key body; found {show(list(data))}")

@@ -87,7 +87,8 @@ class SelectionConfig(Settings):
     """Number of neighbours."""
     passport: Literal["required", "made"] = "made"
     """`required`: of the few best, the first that passes its passport (see `docs/evolution.md`)
-    becomes the champion, or the best where none does; `made`: the best, whatever it does."""
+    becomes the champion, or the best where none does; `made`: the best, whatever it does, with
+    a passport unless `evolution.passport` is false."""
 
 
 class Axis(Settings):

@@ -584,6 +584,8 @@ def load_config(path: str | Path, overrides: Mapping[str, object] | Sequence[str
     if not isinstance(data, dict):
         found = "an empty file" if data is None else show(data)
         raise InputError(f"{short_path(path)}: expected a mapping of settings; found {found}")
+    if "body" in data and "task" not in data:
+        raise InputError(f"{short_path(path)}: expected a configuration; found a robot")
     if is_run_config(path):
         data = locate_files(data, find_copies(Path(os.path.abspath(path.parent))))
         data = with_older_values(data, path.parent)

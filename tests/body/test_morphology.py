@@ -567,6 +567,7 @@ JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
     "text, message",
     [
         ("", "expected a mapping with id, body and brain; found an empty file"),
+        ("task: {type: speed}", "expected a robot; found a configuration"),
         ("body: {type: Bric}", "body.type: expected one of BlueROV2, Core, CoreComponent; found"),
         (
             "body: {type: Core, children: {1: {type: Core}}}",

@@ -94,6 +94,7 @@ def test_wrong_settings(folder, setting, message):
     ("text", "message"),
     [
 ("", "bad.yaml: expected a mapping of settings; found an empty file"),
+("body: {type: Core}", "bad.yaml: expected a configuration; found a robot"),
 (GOOD + "bodies: {genotype: tree}", "bad.yaml: morphology: expected none, as bodies ev"),
 (GOOD + "  duration: -3", "bad.yaml: task.duration: expected a number > 0 and <="),
 (GOOD + "  2: 3", "bad.yaml: task.2: expected the name of a setting"),
