@@ -26,6 +26,7 @@ from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.energy import energy_balance
 from mjx_revolve.engine.forces import motor_torques
 from mjx_revolve.engine.plant import Plant
+from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.self_overlap import self_overlap
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.evaluation import Chunk, task_recorder
@@ -195,7 +196,7 @@ def make_passport(fitness: Fitness, genes: Any, seed: int) -> Passport:
     trajectory = fitness.replay(genes, replay_key(seed))
     checks = (
         *_swim(fitness, genes, key),
-        *_joints(fitness, trajectory),
+        *joint_checks(fitness.robot, trajectory, fitness.settings.settle),
         *_energy(fitness, trajectory, replay_key(seed)),
     )
     return Passport(dict(checks))
@@ -388,12 +389,23 @@ def _silenceable(controller: Controller) -> Controller:
     )
 
 
-def _joints(fitness: Fitness, trajectory: Trajectory) -> Iterator[tuple[str, Check]]:
-    """The loads of one episode on all joints and on the busiest, and the room between modules."""
-    robot = fitness.robot
+def joint_checks(
+    robot: Robot, trajectory: Trajectory, settle: float
+) -> Iterator[tuple[str, Check]]:
+    """The loads of one episode on all joints and on the busiest, and the room between modules.
+
+    Args:
+        robot: it.
+        trajectory: of the episode, with rows at equal times.
+        settle: time at its start that does not count [s].
+
+    Yields:
+        Names, and checks.
+    """
     if not robot.num_hinges:
         return
-    rows = np.asarray(trajectory.time) >= fitness.settings.settle
+    time, step = np.asarray(trajectory.time), robot.world.timestep
+    rows, step = time >= settle, step * round(float(time[1] - time[0]) / step)
     qpos, qvel, ctrl = (
         np.asarray(x)[rows] for x in (trajectory.qpos, trajectory.qvel, trajectory.ctrl)
     )
@@ -402,7 +414,7 @@ def _joints(fitness: Fitness, trajectory: Trajectory) -> Iterator[tuple[str, Che
     yield "overlap", Check("deepest overlap of modules", float(depth.max()), "mm", most=OVERLAP)
     deeper = float(np.mean(depth > OVERLAP))
     yield "overlap_time", Check(f"share of time with more than {OVERLAP:g} mm", deeper)
-    rate = count_reversals(qpos[:, 7:]).max() / (len(qvel) * robot.world.timestep)
+    rate = count_reversals(qpos[:, 7:]).max() / (len(qvel) * step)
     yield "reversals", Check("reversals of a joint", float(rate), "1/s", most=REVERSALS)
     torque = motor_torques(robot, qpos, qvel, ctrl) / robot.assembly.effort[moved]
     used = float(np.sqrt(np.mean(torque**2, 0)).max())

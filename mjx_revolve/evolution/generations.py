@@ -195,6 +195,7 @@ def choose_candidate(
     eligible: np.ndarray,
     seed: int,
     judge: Callable[[int], Passport] | None = None,
+    screen: Callable[[Sequence[int]], Sequence[bool]] | None = None,
 ) -> tuple[int, dict[str, Any]]:
     """Chooses among candidates on fresh starts, and evaluates the winner on others.
 
@@ -208,6 +209,8 @@ def choose_candidate(
         seed: of the run.
         judge: makes a candidate's passport, where that is required: then the best of the best few
             that passes wins, or the best of all where none does.
+        screen: whether candidates may pass, of many at once; those that may not are not judged
+            once the best of all has failed.
 
     Returns:
         The winner's index, and `score`, `std`, `measures`, `key` and `passport` of its `Champion`.
@@ -231,14 +234,16 @@ def choose_candidate(
         raise InputError("champion: expected a score of any candidate; found none: all failed")
     winner, passport = int(order[0]), None
     if judge is not None:
-        first = [int(k) for k in order[:_TRIED] if eligible[k] and means[k] > FAILED_SCORE]
-        tried: dict[int, Passport] = {}
-        for k in first:
-            tried[k] = judge(k)
-            if not tried[k].failed:
-                winner = k
-                break
-        passport = tried.get(winner)
+        passport = judge(winner)
+        if passport.failed:
+            left = [int(k) for k in order[1:] if eligible[k] and means[k] > FAILED_SCORE]
+            if screen is not None:
+                left = [k for k, may in zip(left, screen(left), strict=True) if may]
+            for k in left[: _TRIED - 1]:
+                found = judge(k)
+                if not found.failed:
+                    winner, passport = k, found
+                    break
     scores, measures = fresh([winner], REPORT_STREAM, REPORT_EPISODES)
     return winner, {
         "score": float(scores.mean()),

@@ -10,7 +10,8 @@ import jax
 import numpy as np
 
 from mjx_revolve.episodes.config import Config
-from mjx_revolve.episodes.passport import Passport, make_passport
+from mjx_revolve.episodes.passport import Passport, joint_checks, make_passport
+from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.evolution.blocks import Scored
 from mjx_revolve.evolution.body_fitness import BodyFitness
 from mjx_revolve.evolution.executor import Executor
@@ -86,8 +87,22 @@ class IndividualEvolution:
             one = candidates[k]
             return make_passport(self.fitness.body_fitness(one.body), one.genes, seed)
 
+        def screen(indices: Sequence[int]) -> list[bool]:
+            """Whether joints do in one episode what servos can: one program for all."""
+            robots = [self.fitness.build(candidates[k].body) for k in indices]
+            genes = [np.array(candidates[k].genes, np.float32) for k in indices]
+            swum = self.fitness.mixed.replay(robots, genes, replay_key(seed)) if robots else []
+            settle = self.config.task.settle
+            return [
+                all(check.passed for _, check in joint_checks(robot, trajectory, settle))
+                for robot, trajectory in zip(robots, swum, strict=True)
+            ]
+
         winner, judged = choose_candidate(
-            score, np.ones(len(candidates), bool), seed, judge if required else None
+            score,
+            np.ones(len(candidates), bool),
+            seed,
+            *((judge, screen) if required else ()),
         )
         return self._champion(candidates[winner], **judged)
 

@@ -79,10 +79,13 @@ def test_a_robot_that_folds_into_itself_and_chatters_fails(tmp_path):
         time = 0.2 + 0.005 * np.arange(1, steps + 1)
         return trajectory_of(time, qpos, qvel, qpos[:, 7:])
 
-    good = Passport(dict(passport._joints(fitness, swims(np.zeros(count), 0.0))))
+    def judge(trajectory):
+        return Passport(dict(passport.joint_checks(fitness.robot, trajectory, 0.2)))
+
+    good = judge(swims(np.zeros(count), 0.0))
     assert not good.failed and good.checks["overlap"].value == 0
     curled = swims(np.full(count, 1.5), 0.02)
-    bad = Passport(dict(passport._joints(fitness, curled)))
+    bad = judge(curled)
     assert {"overlap", "reversals"} <= set(bad.failed)
     assert bad.checks["overlap"].value > 10 and bad.checks["overlap_time"].value == 1
     assert bad.checks["reversals"].value == pytest.approx(200, rel=0.02)
