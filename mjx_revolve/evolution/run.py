@@ -193,9 +193,7 @@ class Run:
         config = old.model_copy(update={"evolution": old.evolution.model_copy(update=free)})
         if config.evolution.tensorboard:
             check_tensorboard(label)
-        # A champion is written after a checkpoint: where there is one, all of them are lost.
-        saved = files.checkpoints() or files.champion_path
-        checkpoint = files.load_checkpoint() if saved else None
+        checkpoint = files.load_checkpoint() if files.checkpoints() else None
         for name in checkpoint.damaged if checkpoint else ():
             _log.warning("passed over a damaged checkpoint: %s", name)
         begun = checkpoint.meta if checkpoint else files.info
@@ -213,6 +211,9 @@ class Run:
                 f"{label}: expected the robot and the world that it began with; found them changed "
                 "(a file that config.yaml names, or the program)"
             )
+        if checkpoint is None and files.champion_path:
+            # A champion is written after a checkpoint: all of them are lost, which this says.
+            files.load_checkpoint()
         files.update_info(settings=[*earlier, *_portable(settings, config)])
         run = cls(files, config, executor, make_evolution(config, executor), resumed=True)
         if checkpoint is not None:
