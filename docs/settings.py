@@ -24,7 +24,6 @@ from mjx_revolve.episodes import config as settings
 from mjx_revolve.episodes.tasks import TASKS
 from mjx_revolve.evolution.strategies import STRATEGIES
 from mjx_revolve.inputs.validation_messages import describe, fields_of
-from mjx_revolve.schema import KINDS, show_schema
 from mjx_revolve.water.bed import Bed
 from mjx_revolve.water.buoyancy import BUOYANCY_LAWS
 from mjx_revolve.water.currents import Gust, Shear, Wave
@@ -172,6 +171,6 @@ def make_page() -> str:
 
 if __name__ == "__main__":
     PAGE.write_text(make_page(), encoding="utf-8")
-    for kind in KINDS:
-        SCHEMAS.joinpath(f"{kind}.json").write_text(show_schema(kind), encoding="utf-8")
+    for kind in schema.KINDS:
+        SCHEMAS.joinpath(f"{kind}.json").write_text(schema.show_schema(kind), encoding="utf-8")
     sys.exit(0)

@@ -461,6 +461,11 @@ class Config(Settings):
         return Path(self._source).stem
 
     @property
+    def unit(self) -> str:
+        """The word for its generations: "interval" for a colony."""
+        return "generation" if self.colony is None else "interval"
+
+    @property
     def files(self) -> tuple[NamedFile, ...]:
         """The files that the settings name."""
         found: list[NamedFile] = []

@@ -237,7 +237,7 @@ def choose_candidate(
         passport = judge(winner)
         if passport.failed:
             left = [int(k) for k in order[1:] if eligible[k] and means[k] > FAILED_SCORE]
-            if screen is not None:
+            if left and screen is not None:
                 left = [k for k, may in zip(left, screen(left), strict=True) if may]
             for k in left[: _TRIED - 1]:
                 found = judge(k)

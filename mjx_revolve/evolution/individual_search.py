@@ -91,7 +91,7 @@ class IndividualEvolution:
             """Whether joints do in one episode what servos can: one program for all."""
             robots = [self.fitness.build(candidates[k].body) for k in indices]
             genes = [np.array(candidates[k].genes, np.float32) for k in indices]
-            swum = self.fitness.mixed.replay(robots, genes, replay_key(seed)) if robots else []
+            swum = self.fitness.mixed.replay(robots, genes, replay_key(seed))
             settle = self.config.task.settle
             return [
                 all(check.passed for _, check in joint_checks(robot, trajectory, settle))
@@ -99,16 +99,12 @@ class IndividualEvolution:
             ]
 
         winner, judged = choose_candidate(
-            score,
-            np.ones(len(candidates), bool),
-            seed,
-            *((judge, screen) if required else ()),
+            score, np.ones(len(candidates), bool), seed, judge if required else None, screen
         )
         return self._champion(candidates[winner], **judged)
 
     def _champion(self, one: Individual, **judged: Any) -> Champion:
-        unit = "generation" if self.config.colony is None else "interval"
-        origin = f"individual {one.number} of {unit} {one.born}, {one.origin}"
+        origin = f"individual {one.number} of {self.config.unit} {one.born}, {one.origin}"
         genes = np.array(one.genes, np.float32)
         return Champion(genes=genes, origin=origin, body=one.body, individual=one.number, **judged)
 

@@ -84,8 +84,8 @@ class Run:
 
     @property
     def unit(self) -> str:
-        """The word for its generations: "interval" for a colony."""
-        return "generation" if self.config.colony is None else "interval"
+        """As `Config.unit`."""
+        return self.config.unit
 
     @property
     def resumption(self) -> str:
