@@ -179,7 +179,8 @@ class ControllerConfig(Section):
 class RobustConfig(Settings):
     """Largest factors by which coefficients are multiplied or divided, drawn anew for each trial.
 
-    Uniform in the factor's logarithm, the same for all individuals.
+    Uniform in the factor's logarithm, one trial in each part of its range, the same for all
+    individuals.
     """
 
     drag: Annotated[Number, Ge(1), Le(10), Unit("-")] = 1.5

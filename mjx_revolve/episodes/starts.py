@@ -138,10 +138,18 @@ def _draw_course(task: TaskConfig, key: jax.Array) -> Course | None:
 
 
 def _draw_variation(task: TaskConfig, key: jax.Array) -> Variation | None:
-    """Factors within the ranges of `task.robust`, uniformly in their logarithm, `[trials]` each."""
+    """Factors within the ranges of `task.robust`, uniformly in their logarithm, `[trials]` each.
+
+    A Latin hypercube (McKay, Beckman & Conover 1979): of n trials each factor has one in every nth
+    of its range. A trial's factors are as if drawn alone, and the mean over trials depends little
+    on the draw, so that generations can be compared: parents keep the scores of theirs.
+    """
     if task.robust is None:
         return None
-    shares = jax.random.uniform(jax.random.fold_in(key, 5), (4, task.trials), minval=-1.0)
+    within_key, order_key = jax.random.fold_in(key, 5), jax.random.fold_in(key, 7)
+    within = jax.random.uniform(within_key, (4, task.trials), minval=-1.0)
+    order = jnp.argsort(jax.random.uniform(order_key, within.shape), axis=1)
+    shares = (2 * order + 1 + within) / task.trials - 1
     ranges = [getattr(task.robust, name) for name in Variation._fields]
     return Variation(*(width**share for width, share in zip(ranges, shares, strict=True)))
 
