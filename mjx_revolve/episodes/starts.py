@@ -148,8 +148,8 @@ def _draw_variation(task: TaskConfig, key: jax.Array) -> Variation | None:
         return None
     within_key, order_key = jax.random.fold_in(key, 5), jax.random.fold_in(key, 7)
     within = jax.random.uniform(within_key, (4, task.trials), minval=-1.0)
-    order = jnp.argsort(jax.random.uniform(order_key, within.shape), axis=1)
-    shares = (2 * order + 1 + within) / task.trials - 1
+    parts = (2 * jnp.arange(task.trials) + 1 + within) / task.trials - 1
+    shares = jax.random.permutation(order_key, parts, axis=1, independent=True)
     ranges = [getattr(task.robust, name) for name in Variation._fields]
     return Variation(*(width**share for width, share in zip(ranges, shares, strict=True)))
 
