@@ -92,7 +92,8 @@ class Browser:
         self._session = attached["sessionId"]
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.send(f"{domain}.enable")
-        self.resize(width, height)
+        size = {"width": width, "height": height, "deviceScaleFactor": 1.0, "mobile": False}
+        self.send("Emulation.setDeviceMetricsOverride", **size)
 
     def __enter__(self) -> Self:
         return self
@@ -144,16 +145,6 @@ class Browser:
             address = facts["request"]["url"]
             if not address.startswith("data:"):
                 self.requests.append(address)
-
-    def resize(self, width: int, height: int, scale: float = 1.0) -> None:
-        """Sets the size of the page."""
-        self.send(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=scale,
-            mobile=False,
-        )
 
     def open(self, path: Path, fragment: str = "") -> None:
         """Opens a file and waits until it has drawn a picture."""

@@ -78,6 +78,9 @@ class SelectionConfig(Settings):
     """Parents that stay; `generational` only."""
     max_age: Annotated[Integer, Ge(1)] | None = None
     """Generations after which an individual is removed, however good it is."""
+    reevaluate: bool = False
+    """Whether parents are evaluated again in each generation, on its starts; their scores and
+    measures are means over all evaluations."""
     objectives: Annotated[TupleOf[str], MinLen(1)] = ("score",)
     """Maximised, or with a minus before it minimised: `score`, `novelty`, or a measure or
     descriptor by name. `nsga2` takes several, all others one."""
@@ -176,6 +179,9 @@ class BodiesConfig(Settings):
         selection = self.selection
         if selection.type == "map_elites" and self.archive is None:
             raise ConstraintError("archive", "axes, because selection.type is map_elites", "none")
+        if selection.reevaluate and selection.type in ("map_elites", "random"):
+            off = f"false, as {selection.type} keeps individuals by one evaluation"
+            raise ConstraintError("selection.reevaluate", off, "true")
         if len(selection.objectives) > 1 and selection.type != "nsga2":
             one = f"one, as only nsga2 takes several (selection.type is {selection.type})"
             raise ConstraintError("selection.objectives", one, ", ".join(selection.objectives))

@@ -39,7 +39,7 @@ from mjx_revolve.evolution.individuals import (
     to_text,
     unpack_json,
 )
-from mjx_revolve.evolution.learning import learn, make_learner
+from mjx_revolve.evolution.learning import evaluate_again, learn, make_learner
 from mjx_revolve.evolution.novelty import axis_scale, novelty
 from mjx_revolve.evolution.reproduction import make_child, make_founder
 from mjx_revolve.evolution.selection import SCHEMES, Candidates, check_selection
@@ -182,8 +182,11 @@ class BodyEvolution(IndividualEvolution):
     # --- evaluate and tell
 
     def evaluate(self, proposal: _Proposal) -> list[Individual]:
-        """The individuals with what they have learnt, their scores and measures."""
-        return learn(self.executor, proposal.offspring, proposal.key)
+        """The living, and the new individuals with what they have learnt, with their scores."""
+        search, living = proposal.search, list(proposal.search.living)
+        if living and self.selection.reevaluate:
+            living = evaluate_again(self.executor, living, proposal.key, search.generation + 1)
+        return [*living, *learn(self.executor, proposal.offspring, proposal.key)]
 
     def tell(self, proposal: _Proposal, results: list[Individual]) -> Generation[BodySearch]:
         """The search with survivors, elites and archives brought up to date.
@@ -192,28 +195,28 @@ class BodyEvolution(IndividualEvolution):
         new individual's measures, the living's mean of `MEAN_DESCRIPTORS`, coverage and qd_score
         of the archive. Scores are those of the new individuals.
         """
-        search, born = proposal.search, results
+        search, together, old = proposal.search, results, len(proposal.search.living)
+        born, current = together[old:], {one.number: one for one in together}
         generation, mu = search.generation + 1, self.config.evolution.population_size
-        together = [*search.living, *born]
         new = self._novelty(together, search.novelty_archive)
         archive, archived = _insert(search, born)
         if self.selection.type == "map_elites":
             living = list(archived.values())
         else:
-            candidates = self._candidates(together, new, len(search.living))
+            candidates = self._candidates(together, new, old)
             survivors = self.scheme.survivors(candidates, self.selection, mu, generation)
             living = [together[k] for k in survivors]
-        trials = sum(individual.trials for individual in born)
+        trials = sum(individual.trials for individual in born) + old * self.selection.reevaluate
         found = replace(
             search,
             generation=generation,
             living=tuple(living or born),
-            elites=best_individuals([*search.elites, *born]),
+            elites=best_individuals(
+                [*(current.get(one.number, one) for one in search.elites), *together]
+            ),
             archive=archive,
             archived=archived,
-            novelty_archive=self._add_most_novel(
-                search.novelty_archive, born, new[len(search.living) :]
-            ),
+            novelty_archive=self._add_most_novel(search.novelty_archive, born, new[old:]),
             next_number=search.next_number + len(born),
             trials=search.trials + trials,
             offspring=tuple(born),
@@ -277,8 +280,14 @@ class BodyEvolution(IndividualEvolution):
     # --- files of the run folder
 
     def logs(self, search: BodySearch) -> Mapping[str, Sequence[str]]:
-        """The last generation's individuals, and the numbers of the living."""
-        lines = [to_text(i, self.fitness.genotype) for i in search.offspring]
+        """The last generation's individuals, and the numbers of the living.
+
+        Where parents are evaluated again, those that stay have a line with their new scores, too.
+        """
+        logged = list(search.offspring)
+        if self.selection.reevaluate:
+            logged += [one for one in search.living if one.born < search.generation]
+        lines = [to_text(one, self.fitness.genotype) for one in logged]
         return {INDIVIDUALS: lines, GENERATIONS: [living_line(search)]}
 
     def files(self, search: BodySearch) -> Mapping[str, bytes]:

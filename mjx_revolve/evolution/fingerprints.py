@@ -103,8 +103,14 @@ def settings_hash(config: Config, by_path: bool = False, older_world: Collection
                 del data[section][name]
     if data["bodies"] is not None and not data["bodies"]["max_of"]:
         del data["bodies"]["max_of"]
-    if data["bodies"] is not None and data["bodies"]["selection"]["passport"] == "made":
-        del data["bodies"]["selection"]["passport"]  # older runs lack it
+    if data["bodies"] is not None:
+        selection = data["bodies"]["selection"]
+        for name, usual in {
+            "passport": "made",
+            "reevaluate": False,
+        }.items():  # older runs lack them
+            if selection[name] == usual:
+                del selection[name]
     for name in ("colony", "bodies", "coefficients"):
         if data[name] is None:
             del data[name]

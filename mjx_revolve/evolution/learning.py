@@ -148,6 +148,43 @@ def _taught(learner: _Learner, fitness: BodyFitness) -> Individual:
     return replace(one, learnt=learnt, genes=genes, score=score, measures=measures)
 
 
+def evaluate_again(
+    executor: Executor, individuals: Sequence[Individual], key: jax.Array, generation: int
+) -> list[Individual]:
+    """Evaluates learnt brains on a generation's episodes: explicit averaging over time.
+
+    Scores of one generation are partly luck, which selection of the best adds up; see Jin and
+    Branke, "Evolutionary optimization in uncertain environments — a survey", IEEE Trans.
+    Evolutionary Computation 9(3), 2005.
+
+    Args:
+        executor: an executor over a `BodyFitness`.
+        individuals: evaluated once in each generation since their birth; those of which every
+            trial failed stay as they are.
+        key: of the generation, as for `learn`: the same episodes.
+        generation: its number.
+
+    Returns:
+        The individuals; scores and measures are means over all evaluations, NaN if one blew up.
+    """
+    brains, starts = executor.fitness.brains, jax.random.split(key)[0]
+    again = [one for one in individuals if one.learnt is not None]
+    genes = []
+    for one in again:
+        layout = executor.fitness.layout(one.body)
+        genes.append(brains.express(brains.to_vector(one.learnt, layout)[None], layout))
+    means = {}
+    scored = score_brains(executor, again, genes, starts) if again else []
+    for one, (scores, measures) in zip(again, scored, strict=True):
+        share = 1.0 / (generation - one.born + 1)
+        score = one.score + share * (float(scores[0]) - one.score)
+        mean = {
+            name: x + share * (float(measures[name][0]) - x) for name, x in one.measures.items()
+        }
+        means[one.number] = replace(one, score=score, measures=mean)
+    return [means.get(one.number, one) for one in individuals]
+
+
 def score_brains(
     executor: Executor,
     individuals: Sequence[Individual],

@@ -1,6 +1,7 @@
 """Volumes of meshes against closed forms and trimesh; refusals; the shapes of the modules."""
 
 from dataclasses import replace
+from operator import setitem
 from pathlib import Path
 
 import numpy as np
@@ -87,28 +88,13 @@ def changed(function) -> tuple[np.ndarray, np.ndarray]:
     return function(vertices, faces) or (vertices, faces)
 
 
-def with_nan(vertices, faces):
-    """One vertex that is not a number."""
-    vertices[3, 1] = np.nan
-
-
-def with_turned_face(vertices, faces):
-    """One face wound against its neighbours."""
-    faces[4] = faces[4, ::-1]
-
-
-def with_missing_vertex(vertices, faces):
-    """One face that names a vertex that is not there."""
-    faces[2, 0] = 8
-
-
 BROKEN = {
     "nan": (
-        changed(with_nan),
+        changed(lambda vertices, faces: setitem(vertices, (3, 1), np.nan)),
         "x.stl: expected finite vertices; found 1 of 8 that are not (first: vertex 3)",
     ),
     "missing vertex": (
-        changed(with_missing_vertex),
+        changed(lambda vertices, faces: setitem(faces, (2, 0), 8)),
         "x.stl: expected faces of vertices 0 to 7; found 1 of 12 with others (first: face 2)",
     ),
     "open": (
@@ -116,7 +102,7 @@ BROKEN = {
         "x.stl: expected a closed surface; found 3 open edges of 18",
     ),
     "inconsistent": (
-        changed(with_turned_face),
+        changed(lambda vertices, faces: setitem(faces, 4, faces[4, ::-1].copy())),
         "x.stl: expected faces wound one way; found 3 edges of 18 whose faces are wound against "
         "each other",
     ),

@@ -212,6 +212,29 @@ def test_generations(folder, selection):
         )
 
 
+@pytest.mark.parametrize("kind", ["plus", "generational"])
+def test_scores_of_reevaluated_parents_are_means_over_their_generations(folder, kind):
+    config, executor = start(folder, {"selection": {"type": kind, "reevaluate": True}})
+    history = generations(config, executor)
+    search, last = history[-1]
+    fitness, key = executor.fitness, jax.random.key(config.evolution.seed)
+    assert search.trials == 6 + 4 * (6 + 6) and last["champion"] == search.elites[0].score
+    evolution = BodyEvolution(config, executor)
+    lines = [line for each, _ in history for line in evolution.logs(each)["individuals.jsonl"]]
+    logged = {line["id"]: line["score"] for line in map(json.loads, lines)}
+    ages = set()
+    for one in search.living:
+        wide = np.zeros((1, executor.num_genes), np.float32)
+        wide[:, fitness.layout(one.body).columns] = one.genes
+        keys = [jax.random.fold_in(key, generation) for generation in range(one.born, 6)]
+        starts = [jax.random.split(each)[0] for each in keys]
+        scores = [score_brains(executor, [one], [wide], each)[0][0][0] for each in starts]
+        assert one.score == pytest.approx(np.mean(scores), abs=1e-6)
+        assert logged[one.number] == one.score
+        ages.add(len(scores))
+    assert len(ages) > 1
+
+
 @pytest.mark.slow
 def test_evolution_finds_the_optimum(folder):
     found = {}
@@ -302,7 +325,8 @@ def contents(folder):
 @pytest.mark.slow
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("bodies", [
-    {"learning": {"population_size": 4, "generations": 2, "strategy": "CMA_ES"}},
+    {"learning": {"population_size": 4, "generations": 2, "strategy": "CMA_ES"},
+     "selection": {"reevaluate": True}},
     pytest.param(ARCHIVE, marks=pytest.mark.slow),
     pytest.param(
         {"selection": {"type": "nsga2", "objectives": ["score", "novelty"], "novelty": ["length"]},

@@ -75,7 +75,7 @@ def test_the_cells_of_a_tessellation_are_those_of_the_nearest_centre():
     assert star(figure) == found.centers[np.nanargmax(found.scores)].tolist()
 
 
-def testvoronoi_cells_fill_the_square():
+def test_voronoi_cells_fill_the_square():
     centers = np.random.default_rng(3).random((50, 2))
     polygons = voronoi_cells(centers)
     areas = []
