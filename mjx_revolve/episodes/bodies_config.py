@@ -150,6 +150,9 @@ class BodiesConfig(Settings):
     """Share of the crossed children that are mutated; those that are not crossed always are [-]."""
     crossover: Share = 0.5
     """Share of the children that have two parents [-]."""
+    cloning: Share = 0.0
+    """Share of the children that have their first parent's body as it is: only their brains are
+    mutated, and learn [-]."""
     seeds: Annotated[TupleOf[str], File("morphology")] = ()
     """Morphologies that begin the population, beside random bodies: paths or shipped names."""
     random: Share = 1.0

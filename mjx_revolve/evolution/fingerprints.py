@@ -101,16 +101,13 @@ def settings_hash(config: Config, by_path: bool = False, older_world: Collection
         for name, value in (usual | OLDER[section]).items():
             if data[section][name] == value:
                 del data[section][name]
-    if data["bodies"] is not None and not data["bodies"]["max_of"]:
-        del data["bodies"]["max_of"]
-    if data["bodies"] is not None:
-        selection = data["bodies"]["selection"]
-        for name, usual in {
-            "passport": "made",
-            "reevaluate": False,
-        }.items():  # older runs lack them
-            if selection[name] == usual:
-                del selection[name]
+    if (bodies := data["bodies"]) is not None:
+        for part, name, usual in (
+            (bodies, "max_of", {}), (bodies, "cloning", 0.0),
+            (bodies["selection"], "passport", "made"), (bodies["selection"], "reevaluate", False),
+        ):  # fmt: skip
+            if part[name] == usual:
+                del part[name]
     for name in ("colony", "bodies", "coefficients"):
         if data[name] is None:
             del data[name]

@@ -51,10 +51,10 @@ def make_child(
     second: Individual,
     both_brains: bool = False,
 ) -> Individual:
-    """A child: crossover with probability `bodies.crossover`, then mutation.
+    """A child: a clone's body, or crossover with probability `bodies.crossover`, then mutation.
 
     A child that is not crossed is always mutated, one that is crossed with probability
-    `bodies.mutation`.
+    `bodies.mutation`; of a clone, with probability `bodies.cloning`, only the brain is.
 
     Args:
         fitness: genotype, brains and probabilities.
@@ -70,11 +70,12 @@ def make_child(
         The child, with a brain inherited as `bodies.brains` says.
     """
     genotype, settings = fitness.genotype, fitness.bodies
-    genome, origin = first.genome, "mutation"
-    crossed = first is not second and rng.random() < settings.crossover
+    genome, origin = first.genome, "cloning"
+    cloned = bool(settings.cloning) and rng.random() < settings.cloning
+    crossed = not cloned and first is not second and rng.random() < settings.crossover
     if crossed:
         genome, origin = genotype.cross(rng, genome, second.genome), "crossover"
-    if not crossed or rng.random() < settings.mutation:
+    if not cloned and (not crossed or rng.random() < settings.mutation):
         genome = genotype.mutate(rng, genome)
         origin = "crossover, mutation" if crossed else "mutation"
     parents = (first, second) if crossed or both_brains else (first,)

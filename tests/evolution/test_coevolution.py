@@ -2,6 +2,7 @@
 
 import csv
 import json
+from unittest.mock import Mock
 
 import jax
 import numpy as np
@@ -133,23 +134,13 @@ def test_where_a_passport_is_required_the_living_are_candidates_too(folder, monk
     assert len(tried) == 2 and tried[0] in failing
 
 
-def watch(fitness, seen):
-    """Notes the arguments of all evaluations."""
-    inner = fitness.evaluate
-
-    def note(*arguments):
-        seen.append(arguments)
-        return inner(*arguments)
-
-    object.__setattr__(fitness, "evaluate", note)
-
-
 def test_blocks_hold_one_body_where_many_brains_are_tried(folder):
     for size, alone in ((1, False), (5, False), (6, True), (9, False), (20, True)):
         config, executor = start(folder, {"learning": {"population_size": size}})
-        seen: list = []
-        watch(executor.fitness, seen)
+        watched = Mock(wraps=executor.fitness.evaluate)
+        object.__setattr__(executor.fitness, "evaluate", watched)
         learn(executor, founders(config, executor), jax.random.key(0))
+        seen = [call.args for call in watched.call_args_list]
         assert executor.fitness.one_body_per_block == alone
         assert {len(genes) for genes, *_ in seen} == {8}
         assert all(len(bodies) == 1 for _, _, bodies, _ in seen) == alone
@@ -266,6 +257,18 @@ def test_inheritance(folder):
                     assert any(alike) == all(alike) == (how != "none")
                     pairs += 1
         assert pairs == 24
+
+
+def test_clones_have_the_body_of_a_parent_and_a_brain_of_their_own(folder):
+    config, executor = start(folder, {"cloning": 0.5})
+    known = {}
+    for search, _ in generations(config, executor):
+        known |= {child.number: child for child in search.offspring}
+    clones = [one for one in known.values() if one.origin == "cloning"]
+    assert 6 < len(clones) < 18  # of 24 children
+    for clone in clones:
+        (parent,) = (known[number] for number in clone.parents)
+        assert clone.body == parent.body and clone.brain != parent.learnt
 
 
 @pytest.mark.parametrize("genotype", ["plasticoding", "cppn"])

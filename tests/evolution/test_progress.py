@@ -17,13 +17,10 @@ class Terminal(io.StringIO):
         self.code = encoding
 
     encoding = property(lambda self: self.code)
+    drawn = property(lambda self: self.getvalue().split("\r")[1:])
 
     def isatty(self):
         return True
-
-    @property
-    def drawn(self):
-        return self.getvalue().split("\r")[1:]
 
 
 def row(generation, **more):
