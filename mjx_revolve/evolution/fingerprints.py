@@ -102,11 +102,11 @@ def settings_hash(config: Config, by_path: bool = False, older_world: Collection
             if data[section][name] == value:
                 del data[section][name]
     if (bodies := data["bodies"]) is not None:
-        for part, name, usual in (
-            (bodies, "max_of", {}), (bodies, "cloning", 0.0),
-            (bodies["selection"], "passport", "made"), (bodies["selection"], "reevaluate", False),
-        ):  # fmt: skip
-            if part[name] == usual:
+        for part, later in (
+            (bodies, {"max_of": {}, "cloning": 0.0}),
+            (bodies["selection"], {"passport": "made", "reevaluate": False}),
+        ):
+            for name in [name for name, usual in later.items() if part[name] == usual]:
                 del part[name]
     for name in ("colony", "bodies", "coefficients"):
         if data[name] is None:
