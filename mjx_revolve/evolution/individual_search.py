@@ -17,7 +17,7 @@ from mjx_revolve.evolution.body_fitness import BodyFitness
 from mjx_revolve.evolution.executor import Executor
 from mjx_revolve.evolution.generations import Champion, choose_candidate
 from mjx_revolve.evolution.individuals import Individual, best_individuals
-from mjx_revolve.evolution.learning import score_brains
+from mjx_revolve.evolution.learning import learnt_genes, score_brains
 from mjx_revolve.inputs.errors import InputError
 
 # Descriptors with their population mean in the metrics.
@@ -71,12 +71,7 @@ class IndividualEvolution:
 
         def score(indices: Sequence[int], key: jax.Array) -> Scored:
             chosen = [candidates[k] for k in indices]
-            genes = [
-                self.fitness.mixed.pad_genes(
-                    np.array([one.genes], np.float32), self.fitness.build(one.body)
-                )
-                for one in chosen
-            ]
+            genes = [learnt_genes(self.fitness, one) for one in chosen]
             found = score_brains(self.executor, chosen, genes, key)
             measures = {name: np.concatenate([m[name] for _, m in found]) for name in found[0][1]}
             return np.concatenate([scores for scores, _ in found]), measures

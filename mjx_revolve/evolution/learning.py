@@ -167,14 +167,10 @@ def evaluate_again(
     Returns:
         The individuals; scores and measures are means over all evaluations, NaN if one blew up.
     """
-    brains, starts = executor.fitness.brains, jax.random.split(key)[0]
     again = [one for one in individuals if one.learnt is not None]
-    genes = []
-    for one in again:
-        layout = executor.fitness.layout(one.body)
-        genes.append(brains.express(brains.to_vector(one.learnt, layout)[None], layout))
+    genes = [learnt_genes(executor.fitness, one) for one in again]
     means = {}
-    scored = score_brains(executor, again, genes, starts) if again else []
+    scored = score_brains(executor, again, genes, jax.random.split(key)[0]) if again else []
     for one, (scores, measures) in zip(again, scored, strict=True):
         share = 1.0 / (generation - one.born + 1)
         score = one.score + share * (float(scores[0]) - one.score)
@@ -183,6 +179,12 @@ def evaluate_again(
         }
         means[one.number] = replace(one, score=score, measures=mean)
     return [means.get(one.number, one) for one in individuals]
+
+
+def learnt_genes(fitness: BodyFitness, individual: Individual) -> np.ndarray:
+    """`[1, num_genes]` genes of a learnt brain, for `score_brains`."""
+    genes = np.array([individual.genes], np.float32)
+    return fitness.mixed.pad_genes(genes, fitness.build(individual.body))
 
 
 def score_brains(
