@@ -145,10 +145,7 @@ def test_ctrl_c_stops_after_the_generation_under_way(folder, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ["--set", "task.duration=5,-6"],
-            "duration=-6: --set task.duration: expected a number >",
-        ),
+        (["--set", "task.duration=5,-6"], "duration=-6: --set task.duration: expected a number >"),
         (
             ["--set", "evolution.population_size=8,16", "--set", "task.settle=1,11"],
             "population_size=8+settle=11: --set task.settle: expected a time below task.duration",

@@ -8,15 +8,16 @@ holds one body, which is faster; else bodies share chunks.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import jax
 import numpy as np
 
 from mjx_revolve.body.module_types import ModuleType
-from mjx_revolve.body.morphology import Morphology, load_morphology
+from mjx_revolve.body.morphology import Morphology, load_morphology, trim_neutral
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.bodies_config import BodiesConfig
@@ -28,10 +29,10 @@ from mjx_revolve.episodes.fitness import (
     make_mixed_fitness,
 )
 from mjx_revolve.episodes.measure_table import MEASURES
-from mjx_revolve.episodes.named_files import read_modules
+from mjx_revolve.episodes.named_files import read_modules, read_world
 from mjx_revolve.evolution.blocks import block_size
 from mjx_revolve.evolution.brains import BrainEncoding, GeneLayout, gene_layout, make_brain_encoding
-from mjx_revolve.genotypes.genotype import Genotype, Space, cached, make_space
+from mjx_revolve.genotypes.genotype import Genotype, Space, accept_all, cached, make_space
 from mjx_revolve.genotypes.kinds import find_genotype
 from mjx_revolve.inputs.errors import InputError
 
@@ -175,7 +176,7 @@ def make_body_fitness(config: Config) -> BodyFitness:
     assert bodies is not None
     modules = read_modules(config)
     try:
-        space = make_space(bodies, modules)
+        space = make_space(bodies, modules, _bound_of_trim(config))
         seeds = tuple(_load_seed(path, modules, config, space) for path in bodies.seeds)
         genotype = find_genotype(bodies.genotype, space, bodies.params, config.source)
         _check_seeds(bodies, genotype)
@@ -207,6 +208,21 @@ def _examples(genotype: Genotype) -> list[Morphology]:
     """Random bodies, the same in all processes."""
     rng = np.random.default_rng(0)
     return [genotype.develop(genotype.random(rng)) for _ in range(_EXAMPLES)]
+
+
+def _bound_of_trim(config: Config) -> Callable[[Morphology], bool]:
+    """Body → whether the configuration can trim it: no child may end a run because it floats."""
+    density = read_world(config).density
+    if config.trim != "neutral" or density == 0:
+        return accept_all
+    return partial(_can_be_trimmed, density=density)
+
+
+def _can_be_trimmed(body: Morphology, density: float) -> bool:
+    with suppress(InputError):
+        trim_neutral(body, density)
+        return True
+    return False
 
 
 def _load_seed(

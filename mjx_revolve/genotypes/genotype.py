@@ -77,7 +77,7 @@ class Space:
         max_length: longest edge of the bounding box at rest [m]; None: any.
         max_mass: [kg]; None: any.
         max_of: most modules of a type, by its name; of others, any number.
-        accepts: body → whether it is accepted, for further bounds.
+        accepts: body → whether it is accepted: whether it can be trimmed, where it must be.
     """
 
     catalogue: Mapping[str, ModuleType]
@@ -118,7 +118,7 @@ class Space:
         if self.max_length is not None and body.length > self.max_length * SLACK:
             return f"expected at most {self.max_length:g} m (max_length); found {body.length:g}"
         if not self.accepts(body):
-            return "expected a body that there is room for; found one that is too large or complex"
+            return "expected a body that can be trimmed (trim: neutral); found one that floats"
         return None
 
 
@@ -132,7 +132,7 @@ def make_space(
     Args:
         bodies: settings like `episodes.bodies_config.BodiesConfig`.
         catalogue: all types of modules by name and alias.
-        accepts: body → whether it is accepted, for bounds that are no settings, as a capacity.
+        accepts: as in `Space`.
 
     Returns:
         The space; its types go by their names, not by their aliases.

@@ -265,11 +265,7 @@ body:
         (0.01, [x, -0.002, 0.01]),
         (0.009, [servo, 0, 0]),
     ]
-    volume = [
-        (7.054e-5, [0.01, 0, 0.002]),
-        (3.032e-6, [x, 0, 0]),
-        (1.014e-5, [servo, -0.001, 0]),
-    ]
+    volume = [(7.054e-5, [0.01, 0, 0.002]), (3.032e-6, [x, 0, 0]), (1.014e-5, [servo, -0.001, 0])]
     for found, rows in ((robot.center_of_mass, mass), (robot.center_of_volume, volume)):
         weight = np.array([w for w, _ in rows])
         assert found == pytest.approx(weight @ np.array([at for _, at in rows]) / weight.sum())

@@ -81,3 +81,12 @@ def test_shipped_configurations(name):
     packed = fitness.mixed.pack([fitness.build(body) for body in bodies])
     assert packed.count.max() <= fitness.mixed.capacity.rows
     assert fitness.mixed.touches == (name == "bed_coevolve")
+
+
+@pytest.mark.slow
+def test_no_child_floats_where_all_are_trimmed():
+    big = ["bodies.modules=[ActiveHinge]", "bodies.max_modules=20", "bodies.max_hinges=19"]
+    fitness = make_body_fitness(load_config(find_shipped("lake_coevolve", "configs"), big))
+    genotype, rng = fitness.genotype, np.random.default_rng(1)
+    for _ in range(40):
+        fitness.build(genotype.develop(genotype.mutate(rng, genotype.random(rng))))

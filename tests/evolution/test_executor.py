@@ -246,15 +246,10 @@ def pids_of(executor):
 @pytest.mark.slow
 @pytest.mark.sampled(1)
 @needs_proc
-@pytest.mark.parametrize(
-    ("kind", "how"),
-    [
-        ("kill", "killed by SIGKILL"),
-        ("stop", r"no answer for \d+ s"),
-        ("exit", "exit code 3: out of luck"),
-        ("raise", None),
-    ],
-)
+@pytest.mark.parametrize(("kind", "how"), [
+    ("kill", "killed by SIGKILL"), ("stop", r"no answer for \d+ s"),
+    ("exit", "exit code 3: out of luck"), ("raise", None),
+])  # fmt: skip
 def test_a_lost_worker_is_replaced_and_costs_nothing(troubled, kind, how, caplog):
     executor, order = troubled
     before = pids_of(executor)

@@ -111,10 +111,7 @@ WRONG = [
     ),
     (["a.yaml", "--mjcf", "dir.xml"], "--mjcf dir.xml: expected a file; found a folder"),
     (["a.yaml", "--out", "b", "--sdf", "a.sdf"], "--out: expected a folder or single files; found"),
-    (
-        ["a.yaml", "--duration", "nan"],
-        "--duration: expected a number > 0 and <= 86400 [s]; found",
-    ),
+    (["a.yaml", "--duration", "nan"], "--duration: expected a number > 0 and <= 86400 [s]; found"),
     (["a.yaml", "--mjcf", "file/a.xml"], "--mjcf file/a.xml: expected the folder file; found a"),
     (["run", "--world", "lake"], "world: expected none: a champion swims in the world it evolved"),
 ]

@@ -60,10 +60,7 @@ def test_commands_name_themselves_as_they_were_called(called, words, monkeypatch
     [
         (["a", "--fast"], "unrecognized arguments: --fast (see --help)"),
         ([], "the following arguments are required: path (see --help)"),
-        (
-            ["a", "--duration", "-1"],
-            "--duration: expected a number > 0 and <= 86400 [s]; found",
-        ),
+        (["a", "--duration", "-1"], "--duration: expected a number > 0 and <= 86400 [s]; found"),
         (["a", "--rate", "²"], "--rate: expected a whole number from 1 to 9; found '²' (see"),
         (["a", "--count", "9" * 5000], "--count: expected a whole number >= 1; found '999"),
     ],

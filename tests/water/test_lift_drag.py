@@ -277,10 +277,7 @@ def test_centre_of_pressure():
 
 @pytest.mark.parametrize(
     "p",
-    [
-        LiftDrag(area=0.5, density=500.0),
-        LiftDrag(cla=3.0, radial_symmetry=True),
-    ],
+    [LiftDrag(area=0.5, density=500.0), LiftDrag(cla=3.0, radial_symmetry=True)],
     ids=["density", "radial"],
 )
 def test_own_density_area_and_symmetry_reach_the_step(p):

@@ -75,11 +75,7 @@ def test_what_a_step_asks_of_a_world():
     assert (is_uniform(still), needs_horizontal_position(still)) == (True, False)
     assert not needs_horizontal_position(drifting)
     field = CurrentField([0.0], [0.0], [0.0], np.zeros((1, 1, 1, 3)))
-    for fields in (
-        {"waves": SEA},
-        {"shear": {"velocity": [1, 0, 0]}},
-        {"current_field": field},
-    ):
+    for fields in ({"waves": SEA}, {"shear": {"velocity": [1, 0, 0]}}, {"current_field": field}):
         world = make_world(**fields)
         assert (is_uniform(world), needs_horizontal_position(world)) == (False, True)
 
@@ -202,11 +198,7 @@ def test_waves_are_carried_by_the_worlds_current():
     ("shear", "depth", "share"),
     [
         (Shear((1, 2, 0), 4.0), [-1, 0, 1, 2, 3.9, 4, 9], [1, 1, 0.75, 0.5, 0.025, 0, 0]),
-        (
-            Shear((1, 2, 0), 4.0, "power", 0.5),
-            [-1, 0, 3, 3.75, 4, 9],
-            [1, 1, 0.5, 0.25, 0, 0],
-        ),
+        (Shear((1, 2, 0), 4.0, "power", 0.5), [-1, 0, 3, 3.75, 4, 9], [1, 1, 0.5, 0.25, 0, 0]),
         (Shear((1, 2, 0), 4.0, "power"), [0, 2, 4], [1, 0.5 ** (1 / 7), 0]),
         (
             Shear((1, 2, 0), 4.0, "exponential"),

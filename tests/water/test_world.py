@@ -131,20 +131,11 @@ def test_overrides(override, field, expected):
 
 WRONG = [
     ({"density": math.nan}, "density: expected a number >= 0 [kg/m3]; found nan"),
-    (
-        {"densty": 1000},
-        f"densty: expected one of {count(World)} keys; {UNKNOWN} density?",
-    ),
-    (
-        {"gravity": (1, 0, -9.8)},
-        f"{DOWN} (1, 0, -9.8)",
-    ),
+    ({"densty": 1000}, f"densty: expected one of {count(World)} keys; {UNKNOWN} density?"),
+    ({"gravity": (1, 0, -9.8)}, f"{DOWN} (1, 0, -9.8)"),
     ({"current": (0, "x", 0)}, "current.1: expected a number [m/s]; found 'x'"),
     ({"buoyancy": "half"}, "buoyancy: expected one of partial, mask, off; found 'half'"),
-    (
-        {"drag": "boxes"},
-        f"drag: expected {drag_names()}; found 'boxes'",
-    ),
+    ({"drag": "boxes"}, f"drag: expected {drag_names()}; found 'boxes'"),
     (
         {"bed": "sand"},
         "bed: expected 'off', a height in metres or a mapping with kind; found 'sand'",
@@ -160,10 +151,7 @@ WRONG = [
         "(also wrong or missing: shear.velocity)",
     ),
     ({"gust": {"std": [1, -2, 0]}}, "gust.std.1: expected a number >= 0 [m/s]; found -2"),
-    (
-        {"waves": {"amplitude": 0.1}},
-        "waves.0: expected either wavelength or period; found none",
-    ),
+    ({"waves": {"amplitude": 0.1}}, "waves.0: expected either wavelength or period; found none"),
     (
         {"waves": {"amplitude": 0.1, "wavelength": 3, "period": 1}},
         "waves.0: expected either wavelength or period; found both",
@@ -178,10 +166,7 @@ WRONG = [
         {"waves": {"amplitude": 0.05, "wavelength": 10}, "water_depth": 0.1},
         "waves.0.amplitude: expected at most 0.0446, or a wave 10 m long breaks; found 0.05",
     ),
-    (
-        {"current_field": "none.npz"},
-        "current_field: none.npz: expected a file; found none",
-    ),
+    ({"current_field": "none.npz"}, "current_field: none.npz: expected a file; found none"),
 ]
 
 
