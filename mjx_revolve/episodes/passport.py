@@ -324,9 +324,11 @@ def _scores(
     times = [usual, *(t for t in (_MIDDLE, _LONG) if long and t > usual)]
 
     def spec(seconds: float) -> Fitness:
-        task = fitness.settings.model_copy(
-            update={"duration": seconds, "trials": _STARTS, "robust": None}
-        )
+        changes = {"duration": seconds, "trials": _STARTS, "robust": None}
+        horizon = fitness.settings.horizon
+        if horizon is not None and seconds > horizon:  # the way itself: nothing is left to foretell
+            changes["horizon"] = None
+        task = fitness.settings.model_copy(update=changes)
         return replace(fitness, config=fitness.config.model_copy(update={"task": task}))
 
     specs = {seconds: spec(seconds) for seconds in times}

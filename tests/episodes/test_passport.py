@@ -51,6 +51,12 @@ def test_what_only_drifts_fails_without_its_brain_alone(tmp_path, short):
     wide = passport._scores(fitness, genes.astype(np.float32), key, varied, True)[0.6]
     np.testing.assert_allclose(wide[:8], own, atol=1e-5)
     np.testing.assert_allclose(wide[64 + 6 * 8 :], own, atol=1e-5)  # nothing to silence
+    # What lasts longer than the horizon is not foretold.
+    near = make_fitness(settings | {"task": TASK | {"horizon": 0.9}})
+    both = (
+        passport._scores(x, genes.astype(np.float32), key, lanes, True) for x in (fitness, near)
+    )
+    np.testing.assert_allclose(*(scores[1.2] for scores in both), rtol=1e-5)
 
 
 @pytest.mark.parametrize(
