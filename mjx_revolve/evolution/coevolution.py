@@ -60,6 +60,7 @@ class BodySearch:
         archive: the best of each kind, or None.
         archived: `{number: individual}` of those in the archive.
         novelty_archive: `[K, D]` features of the most novel individual of each generation.
+        novelty_ids: `[K]` its number.
         next_number: of the next individual.
         trials: brains that were tried.
         seconds: time spent in generations [s]; not reproducible.
@@ -72,6 +73,7 @@ class BodySearch:
     archive: Archive | None = None
     archived: Mapping[int, Individual] = field(default_factory=dict)
     novelty_archive: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    novelty_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     next_number: int = 0
     trials: int = 0
     seconds: float = 0.0
@@ -164,7 +166,7 @@ class BodyEvolution(IndividualEvolution):
         evolution, living = self.config.evolution, search.living
         count = self.selection.offspring or evolution.population_size
         rng = np.random.default_rng([evolution.seed, generation])
-        new = self._novelty(living, search.novelty_archive)
+        new = self._novelty(living, search)
         candidates = self._candidates(living, new, len(living))
         pairs = self.scheme.parents(rng, candidates, self.selection, count)
         return [
@@ -198,7 +200,7 @@ class BodyEvolution(IndividualEvolution):
         search, together, old = proposal.search, results, len(proposal.search.living)
         born, current = together[old:], {one.number: one for one in together}
         generation, mu = search.generation + 1, self.config.evolution.population_size
-        new = self._novelty(together, search.novelty_archive)
+        new = self._novelty(together, search)
         archive, archived = _insert(search, born)
         if self.selection.type == "map_elites":
             living = list(archived.values())
@@ -207,6 +209,7 @@ class BodyEvolution(IndividualEvolution):
             survivors = self.scheme.survivors(candidates, self.selection, mu, generation)
             living = [together[k] for k in survivors]
         trials = sum(individual.trials for individual in born) + old * self.selection.reevaluate
+        past, ids = self._add_most_novel(search, born, new[old:])
         found = replace(
             search,
             generation=generation,
@@ -216,7 +219,8 @@ class BodyEvolution(IndividualEvolution):
             ),
             archive=archive,
             archived=archived,
-            novelty_archive=self._add_most_novel(search.novelty_archive, born, new[old:]),
+            novelty_archive=past,
+            novelty_ids=ids,
             next_number=search.next_number + len(born),
             trials=search.trials + trials,
             offspring=tuple(born),
@@ -260,22 +264,27 @@ class BodyEvolution(IndividualEvolution):
             is_child=np.arange(len(individuals)) >= old,
         )
 
-    def _novelty(self, individuals: Sequence[Individual], past: np.ndarray) -> np.ndarray:
+    def _novelty(self, individuals: Sequence[Individual], search: BodySearch) -> np.ndarray:
         """`[N]` novelty; 0 where it is no objective."""
         if not self.selection.novelty:
             return np.zeros(len(individuals))
         points = features(individuals, self.selection.novelty)
+        # Those of the archive that live on are among the individuals: none is its own neighbour.
+        here = np.isin(search.novelty_ids, [one.number for one in individuals])
+        past = search.novelty_archive[~here]
         scale = axis_scale(np.concatenate([points, past]))
         return novelty(points, past, self.selection.neighbours, scale)
 
     def _add_most_novel(
-        self, past: np.ndarray, born: Sequence[Individual], new: np.ndarray
-    ) -> np.ndarray:
-        """The archive of novelty, and the most novel of those that were born."""
+        self, search: BodySearch, born: Sequence[Individual], new: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The archive of novelty and its numbers, with the most novel of those that were born."""
+        past, ids = search.novelty_archive, search.novelty_ids
         if not self.selection.novelty or not np.isfinite(new).any():
-            return past
+            return past, ids
         best = born[int(np.nanargmax(new))]
-        return np.concatenate([past, features([best], self.selection.novelty)])
+        point = features([best], self.selection.novelty)
+        return np.concatenate([past, point]), np.append(ids, best.number)
 
     # --- files of the run folder
 
@@ -302,7 +311,7 @@ class BodyEvolution(IndividualEvolution):
         """A search as named arrays."""
         everyone = (*search.living, *search.elites, *search.archived.values())
         found = state_to_arrays(search, _COUNTERS, self.config.evolution.seed)
-        found["past"] = search.novelty_archive
+        found |= {"past": search.novelty_archive, "past_ids": search.novelty_ids}
         for name in ("living", "elites"):
             found[name] = np.array([i.number for i in getattr(search, name)], np.int64)
         found["individuals"] = pack_json(to_records(everyone, self.fitness.genotype))
@@ -328,6 +337,8 @@ class BodyEvolution(IndividualEvolution):
                 archive=archive,
                 archived={n: known[n] for n in ids},
                 novelty_archive=arrays["past"],
+                # Earlier versions kept no numbers.
+                novelty_ids=arrays.get("past_ids", np.full(len(arrays["past"]), -1)),
                 **counters,
             )
 
