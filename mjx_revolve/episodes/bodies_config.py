@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, MinLen, Unit
@@ -22,6 +23,7 @@ from mjx_revolve.inputs.user_code import short_name
 
 Scheme = Literal["plus", "comma", "generational", "steady", "nsga2", "map_elites", "random"]
 """How survivors are chosen; `evolution.selection.SCHEMES` has the functions."""
+_MOST_CELLS = 10_000_000  # of a grid, some hundred megabytes per column: a choice
 
 
 class BrainsConfig(Settings):
@@ -47,7 +49,8 @@ class LearningConfig(Settings):
     """
 
     strategy: Annotated[str, MinLen(1)] = "SNES"
-    """Name of an evosax strategy."""
+    """Name of an evosax strategy. With one generation there is nothing for it to follow: brains are
+    drawn around the one of birth."""
     population_size: Annotated[Integer, Ge(1)] = 1
     """Brains that are tried at a time; the first of them is the one of its birth."""
     generations: Annotated[Integer, Ge(1)] = 1
@@ -123,6 +126,9 @@ class ArchiveConfig(Settings):
             raise ConstraintError(
                 "axes", "at least two descriptors or measures", str(len(self.axes))
             )
+        cells = math.prod(axis.cells for axis in self.axes.values())
+        if self.type == "grid" and cells > _MOST_CELLS:
+            raise ConstraintError("axes", f"at most {_MOST_CELLS:,} cells", f"{cells:,}")
         return self
 
 
@@ -182,12 +188,16 @@ class BodiesConfig(Settings):
         selection = self.selection
         if selection.type == "map_elites" and self.archive is None:
             raise ConstraintError("archive", "axes, because selection.type is map_elites", "none")
-        if selection.reevaluate and selection.type in ("map_elites", "random"):
-            off = f"false, as {selection.type} keeps individuals by one evaluation"
+        if selection.reevaluate and (self.archive or selection.type == "random"):
+            keeper = "an archive" if self.archive else "random"
+            off = f"false, as {keeper} keeps individuals by one evaluation"
             raise ConstraintError("selection.reevaluate", off, "true")
         if len(selection.objectives) > 1 and selection.type != "nsga2":
             one = f"one, as only nsga2 takes several (selection.type is {selection.type})"
             raise ConstraintError("selection.objectives", one, ", ".join(selection.objectives))
+        if selection.type == "map_elites" and selection.objectives != ("score",):
+            best = "score, as the cells of map_elites keep the best by it"
+            raise ConstraintError("selection.objectives", best, ", ".join(selection.objectives))
         wants = any(name.lstrip("-") == "novelty" for name in selection.objectives)
         if wants and not selection.novelty:
             named = "descriptors or measures, because novelty is an objective"

@@ -265,9 +265,10 @@ class TaskConfig(Section):
     """Height above the bed: of the core at the start, then of the robot's `point`; `follow_bed`
     requires it [m]."""
     depth_tolerance: Annotated[Positive, Unit("m")] = 0.25
-    """Largest distance from the start depth, or from `height`, that counts as keeping it [m]."""
+    """Distance from the start depth, or from `height`, up to which progress counts in full; beyond,
+    it counts less and less, from twice the distance on not at all [m]."""
     energy_weight: Annotated[NonNegative, Unit("1/J")] = 0.0
-    """Score lost per joule of joint work [1/J]."""
+    """Score lost per joule of work of servos and propellers, summed without sign [1/J]."""
     start_tilt: Annotated[NonNegative, Unit("rad")] = 0.1
     """Standard deviation of the start's roll and pitch [rad]."""
     start_attitude: Literal["level", "righted"] = "level"

@@ -21,7 +21,7 @@ from mjx_revolve.evolution.body_fitness import BodyFitness
 from mjx_revolve.evolution.brains import GeneLayout
 from mjx_revolve.evolution.executor import Executor
 from mjx_revolve.evolution.individuals import Individual
-from mjx_revolve.evolution.strategies import Strategy, make_strategy
+from mjx_revolve.evolution.strategies import Strategy, find_strategy, make_strategy
 from mjx_revolve.inputs.errors import InputError
 
 
@@ -54,15 +54,18 @@ def make_learner(settings: LearningConfig, size: int) -> Strategy | Perturbation
     Raises:
         InputError: there is no such strategy, or it cannot take the population size.
     """
-    if settings.generations == 1:
-        return Perturbation(settings.population_size, settings.std_init)
-    if settings.population_size < 2:
+    alone = settings.generations == 1
+    if settings.population_size < 2 and not alone:
         raise InputError(
             "bodies.learning.population_size: expected at least 2, as there are "
             f"{settings.generations} generations to learn in; found 1"
         )
     try:
-        return make_strategy(settings, size)
+        if not alone:
+            return make_strategy(settings, size)
+        if "strategy" in settings.model_fields_set:  # else nothing of evosax needs to be imported
+            find_strategy(settings.strategy)
+        return Perturbation(settings.population_size, settings.std_init)
     except InputError as error:
         text = str(error)
         if text.startswith("evolution."):
@@ -160,7 +163,7 @@ def evaluate_again(
     Args:
         executor: an executor over a `BodyFitness`.
         individuals: evaluated once in each generation since their birth; those of which every
-            trial failed stay as they are.
+            trial failed, or that are lost with their workers now, stay as they are.
         key: of the generation, as for `learn`: the same episodes.
         generation: its number.
 
@@ -172,8 +175,11 @@ def evaluate_again(
     means = {}
     scored = score_brains(executor, again, genes, jax.random.split(key)[0]) if again else []
     for one, (scores, measures) in zip(again, scored, strict=True):
+        if np.isnan(scores[0]):
+            continue
         share = 1.0 / (generation - one.born + 1)
-        score = one.score + share * (float(scores[0]) - one.score)
+        blew_up = np.isneginf(scores[0])
+        score = np.nan if blew_up else one.score + share * (float(scores[0]) - one.score)
         mean = {
             name: x + share * (float(measures[name][0]) - x) for name, x in one.measures.items()
         }
@@ -202,7 +208,8 @@ def score_brains(
         key: draws the episodes' starts and water.
 
     Returns:
-        For each body, `[L]` scores, NaN where a rollout blew up, and `[L]` measures.
+        For each body, `[L]` scores, −inf where a rollout blew up and NaN where its workers failed,
+        and `[L]` measures.
     """
     fitness: BodyFitness = executor.fitness
     owner = np.repeat(np.arange(len(genes)), [len(g) for g in genes])
@@ -228,7 +235,7 @@ def score_brains(
         for name, values in figures.items():
             whole = measures.setdefault(name, np.full(len(rows), np.nan, np.float32))
             whole[part] = np.asarray(values)[: len(part)]
-    scores[~(scores > fitness.worst_score)] = np.nan
+    scores[scores <= fitness.worst_score] = -np.inf
     return [(scores[k], {name: values[k] for name, values in measures.items()}) for k in mine]
 
 

@@ -199,9 +199,9 @@ class RunFolder(RunReader):
             for name in ("metrics.csv", *LOGS):
                 (self.path / name).unlink(missing_ok=True)
         else:
-            for name, position in checkpoint.positions.items():
+            for name in ("metrics.csv", *LOGS):
                 if (self.path / name).exists():
-                    os.truncate(self.path / name, position)
+                    os.truncate(self.path / name, checkpoint.positions.get(name, 0))
             for path in self.checkpoints():
                 if generation_of(path) > checkpoint.meta["generation"]:
                     path.unlink(missing_ok=True)

@@ -171,6 +171,9 @@ def make_alphabet(space: Space, upright: bool = True) -> dict[str, Letter]:
     Returns:
         Letters by name: Revolve's where it has one, F for a fin, T and LT for the thrusters; for
         users' types their names, with a suffix 1 or 2 for joints.
+
+    Raises:
+        InputError: two things have the same letter.
     """
     found = {}
     for kind in space.kinds:
@@ -178,6 +181,11 @@ def make_alphabet(space: Space, upright: bool = True) -> dict[str, Letter]:
         own = (f"{kind.name}1", f"{kind.name}2") if hinge else (kind.name, f"{kind.name}V")
         names = _LETTERS.get(kind.name, own)
         for k, name in enumerate(names if hinge or upright else names[:1]):
+            if name in found or name in (CORE, *MOUNTING, *MOVING):
+                raise InputError(
+                    f"bodies.modules: expected types with letters of their own; found {name!r} "
+                    f"of {kind.name}, which stands for something else"
+                )
             found[name] = Letter(kind, upright=k == 1)
     return found
 

@@ -76,6 +76,12 @@ def test_defaults(folder):
 ("task.direction=[0, 0, 0]", "task.direction: expected a vector of some length; found"),
 ("task={type: speed, duration: 6, horizon: 3}", "--set task.horizon: expected a time >= "
          "task.duration (6 s); found 3"),
+("bodies={archive: &a {axes: {a: {low: 0, high: 1, cells: 9999}, b: {low: 0, high: 1, cells: "
+         "9999}}}}", "--set bodies.archive.axes: expected at most 10,000,000 cells; found 99,98"),
+("bodies={selection: {reevaluate: true}, archive: {axes: {a: {low: 0, high: 1}, b: {low: 0, "
+         "high: 1}}}}", "bodies.selection.reevaluate: expected false, as an archive keeps in"),
+("bodies={selection: {type: map_elites, objectives: [-mass]}, archive: {axes: {a: {low: 0, "
+         "high: 1}, b: {low: 0, high: 1}}}}", "bodies.selection.objectives: expected score, as"),
 ("task.durtion=5", "--set task.durtion: expected one of 32 keys; found an unknown key; "
          "did you mean task.duration?"),
 ("wrld=lake", "found an unknown key; did you mean world?"),

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from unittest.mock import Mock
 
 import jax
@@ -20,9 +21,10 @@ from mjx_revolve.evolution import run_folder as runs
 from mjx_revolve.evolution.coevolution import BodyEvolution
 from mjx_revolve.evolution.executor import Executor
 from mjx_revolve.evolution.generations import run_generations
-from mjx_revolve.evolution.individuals import from_record, to_record
-from mjx_revolve.evolution.learning import learn, score_brains
+from mjx_revolve.evolution.individuals import features, from_record, to_record
+from mjx_revolve.evolution.learning import evaluate_again, learn, score_brains
 from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
 from toys import CLOCK, make_toy_bodies
 
 
@@ -96,6 +98,8 @@ def test_learning_improves_and_is_what_counts(folder):
     assert min(gains) >= 0 and np.mean(gains) > 0.05
     for individual in learned:
         assert individual.trials == 48 and individual.brain in [n.brain for n in naive]
+    with pytest.raises(InputError, match=r"^bodies.learning.strategy: expected one of"):
+        founders(*start(folder, {"learning": {"strategy": "guess"}}))
     # Scored by itself, what was learnt gives the score again, on the same starts.
     wide = np.zeros((len(learned), 1, executor.num_genes), np.float32)
     for row, individual in zip(wide, learned, strict=True):
@@ -195,6 +199,12 @@ def test_generations(folder, selection):
     for individual in search.living:
         assert all(parent < individual.number for parent in individual.parents)
         assert individual.born == 1 or individual.parents or selection["type"] == "random"
+    if "novelty" in selection:  # none is its own neighbour
+        own = features(search.living, selection["novelty"])
+        numbers = np.array([one.number for one in search.living])
+        known = [replace(search, novelty_archive=own[n:], novelty_ids=numbers[n:]) for n in (0, 6)]
+        evolution = BodyEvolution(config, executor)
+        np.testing.assert_array_equal(*(evolution._novelty(search.living, k) for k in known))
     again, repeated = run(config, executor)
     assert all(map(lambda a, b: same(a, b, executor.fitness), search.living, again.living))
     for row, other in zip(rows, repeated, strict=True):
@@ -224,6 +234,17 @@ def test_scores_of_reevaluated_parents_are_means_over_their_generations(folder, 
         assert logged[one.number] == one.score
         ages.add(len(scores))
     assert len(ages) > 1
+
+
+def test_what_workers_lose_costs_no_score_and_a_blow_up_costs_all(folder, monkeypatch):
+    config, executor = start(folder)
+    one = learn(executor, founders(config, executor), jax.random.key(0))[0]
+    for score, expected in ((np.nan, one.score), (-np.inf, np.nan)):
+        found = [(np.array([score]), dict.fromkeys(one.measures, np.zeros(1)))]
+        where = "mjx_revolve.evolution.learning.score_brains"
+        monkeypatch.setattr(where, lambda *_, found=found: found)
+        (again,) = evaluate_again(executor, [one], jax.random.key(1), 2)
+        assert again.score == pytest.approx(expected, nan_ok=True)
 
 
 @pytest.mark.slow

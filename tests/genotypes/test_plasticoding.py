@@ -1,6 +1,9 @@
 """Plasticoding: the L-system worked by hand, step by step."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from laboratory import tree
 from mjx_revolve.body.catalogue import MODULES, load_modules
@@ -8,6 +11,7 @@ from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.genotypes.genotype import Space
 from mjx_revolve.genotypes.kinds import find_genotype
 from mjx_revolve.genotypes.plasticoding import Grammar, draw_sentence, expand, make_alphabet
+from mjx_revolve.inputs.errors import InputError
 
 ALL = ("FixedBrick", "ActiveHinge", "TouchSensor", "Fin", "Thruster", "LiftThruster")
 SPACE = Space(MODULES, ALL, "Core", 1, 20, 0, 10)
@@ -18,11 +22,15 @@ def draw(sentence, space=SPACE, seed=None):
     return draw_sentence(sentence.split(), make_alphabet(space), space, seed=seed)
 
 
-RULES = {
-    "C": ("C", "addf", "AJ1", "moveb"),
-    "AJ1": ("AJ1", "addf", "B"),
-    "B": ("addl", "ST", "B"),
-}
+RULES = {"C": ("C", "addf", "AJ1", "moveb"), "AJ1": ("AJ1", "addf", "B"), "B": ("addl", "ST", "B")}
+
+
+def test_each_letter_stands_for_one_thing():
+    brick = replace(MODULES["FixedBrick"], name="B")
+    with pytest.raises(InputError, match="found 'B' of B, which stands for something else"):
+        make_alphabet(
+            replace(SPACE, catalogue={**MODULES, "B": brick}, modules=("FixedBrick", "B"))
+        )
 
 
 def test_a_sentence_grows_by_its_rules():
