@@ -43,8 +43,10 @@ _HEAD = """# Tasks, controllers and all settings
 
 Written by `python docs/settings.py` from the code that reads configurations; do not edit it by
 hand. Each setting can be replaced on the command line, as in `--set task.duration=5`; what is left
-out has the value under "usual". A value that does not fit is refused with one line that says what
-was expected.
+out has the value under "usual". `task.robust`, `bodies`, `bodies.archive`, `colony` and
+`colony.energy` are off where they are left out; with them come their usual values
+(`task.robust: true` has all of its own). A value that does not fit is refused with one line that
+says what was expected.
 """
 
 
