@@ -23,7 +23,7 @@ from mjx_revolve.inputs.user_code import short_name
 
 Scheme = Literal["plus", "comma", "generational", "steady", "nsga2", "map_elites", "random"]
 """How survivors are chosen; `evolution.selection.SCHEMES` has the functions."""
-_MOST_CELLS = 10_000_000  # of a grid, some hundred megabytes per column: a choice
+_MOST_CELLS = 10_000_000  # of a grid, 80 MB for a number of each: a choice
 
 
 class BrainsConfig(Settings):

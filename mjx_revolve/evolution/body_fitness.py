@@ -212,10 +212,11 @@ def _examples(genotype: Genotype) -> list[Morphology]:
 
 def _bound_of_trim(config: Config) -> Callable[[Morphology], bool]:
     """Body → whether the configuration can trim it: no child may end a run because it floats."""
-    density = read_world(config).density
-    if config.trim != "neutral" or density == 0:
+    if config.trim == "none":
         return accept_all
-    return partial(_can_be_trimmed, density=density)
+    density = read_world(config).density
+    # Water without a density is refused when the first body is built.
+    return partial(_can_be_trimmed, density=density) if density > 0 else accept_all
 
 
 def _can_be_trimmed(body: Morphology, density: float) -> bool:

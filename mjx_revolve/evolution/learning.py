@@ -54,14 +54,14 @@ def make_learner(settings: LearningConfig, size: int) -> Strategy | Perturbation
     Raises:
         InputError: there is no such strategy, or it cannot take the population size.
     """
-    alone = settings.generations == 1
-    if settings.population_size < 2 and not alone:
+    once = settings.generations == 1
+    if settings.population_size < 2 and not once:
         raise InputError(
             "bodies.learning.population_size: expected at least 2, as there are "
             f"{settings.generations} generations to learn in; found 1"
         )
     try:
-        if not alone:
+        if not once:
             return make_strategy(settings, size)
         if "strategy" in settings.model_fields_set:  # else nothing of evosax needs to be imported
             find_strategy(settings.strategy)
