@@ -90,8 +90,16 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     if arguments.resume is None and arguments.robot is None:
         raise InputError("expected a ROBOT and a RECORDING, or --resume DIR; found neither")
-    if arguments.resume is not None and (arguments.robot or arguments.out):
-        raise InputError("--resume: expected neither ROBOT nor --out beside it; found one")
+    if arguments.resume is not None:
+        options = ("robot", "out", "columns", "plan", "world", "modules", "seed", "settings")
+        found = [name for name in options if getattr(arguments, name)]
+        if found or arguments.free != _FREE:
+            raise InputError(
+                "--resume: expected --trust alone beside it, as the folder has all else; found "
+                f"{(found or ['free'])[0].replace('columns', 'map').replace('settings', 'set')}"
+            )
+    if arguments.plan and (arguments.columns or arguments.out or arguments.seed):
+        raise InputError("--plan: expected neither --map, --out nor --seed; found one")
     if arguments.plan and arguments.recordings:
         raise InputError("--plan: expected a ROBOT and no recordings; found some")
     if arguments.resume is None and not arguments.plan and not arguments.recordings:
@@ -103,7 +111,9 @@ def main(argv: list[str] | None = None) -> int:
             )
     with Interrupts() as interrupts:
         runtime.prepare_process()
-        named = [arguments.resume or arguments.robot, *arguments.recordings]
+        maps = [x for x in arguments.columns if "=" not in x]
+        named = [arguments.resume or arguments.robot, *arguments.recordings, *maps]
+        named += [x for x in (arguments.world, arguments.modules) if x is not None]
         with opening(*named, trust=arguments.trust):
             if arguments.plan:
                 return _plan(arguments)
@@ -188,7 +198,7 @@ def describe(fit: Fit) -> list[str]:
         what = "held out" if held else "fitted"
         lines.append(
             f"{p.name}, {what}: {p.error(p.fitted, held):.3g} off (before: "
-            f"{p.error(p.before, held):.3g}), of a way of {p.way:.3g}"
+            f"{p.error(p.before, held):.3g})" + (f", of a way of {p.way:.3g}" if p.way else "")
         )
     for kind, sigma in fit.estimate.noise.items():
         if sigma > _MUCH * NOISE[kind]:
@@ -197,7 +207,7 @@ def describe(fit: Fit) -> list[str]:
                 "law or the robot is another one, or the search went astray; trust no interval"
             )
     if not fit.state.finished:
-        lines.append("the search has not arrived: give it more --set iterations")
+        lines.append("the search has not arrived: begin anew with more --set iterations")
     if fit.advice:
         lines.append(f"the most informative motion: {fit.advice}")
     return lines

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 
-from mjx_revolve.inputs.commands import Parser, program, read_path, run_command
+from mjx_revolve.inputs.commands import Parser, check_absent, program, read_path, run_command
 from mjx_revolve.inputs.files import read_file, short_path
 
 
@@ -34,7 +34,10 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("file", type=read_path, help="URDF or MJCF")
     parser.add_argument(
-        "--out", type=read_path, metavar="DIR", default=".", help="folder (default: here)"
+        "--out",
+        type=read_path,
+        metavar="DIR",
+        help="folder; files of these names in it are replaced (default: here, where none is)",
     )
     arguments = parser.parse_args(argv)
     read_file(arguments.file, 1)  # it is there
@@ -42,7 +45,10 @@ def main(argv: list[str] | None = None) -> int:
     from mjx_revolve.formats.import_robot import import_robot
 
     robot = import_robot(arguments.file)
-    body, modules = (short_path(path) for path in robot.save(arguments.out))
+    if arguments.out is None:
+        for path in robot.paths():
+            check_absent(path)
+    body, modules = (short_path(path) for path in robot.save(arguments.out or "."))
     print(f"{body}, {modules}: {robot.morphology.counts}, {robot.morphology.mass:.4g} kg, "
           f"{1e6 * robot.morphology.volume:.4g} cm³")  # fmt: skip
     for line in robot.missing:

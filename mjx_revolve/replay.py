@@ -167,16 +167,14 @@ def main(argv: list[str] | None = None) -> int:
         if arguments.html or arguments.ancestors is not None:
             raise InputError("--colony: expected neither --html nor --ancestors; found one")
     arguments.size = arguments.size or (_WIDE if arguments.colony else _USUAL)
-    paths = (
-        None if out is None else _named_paths(out, kinds, "colony" if arguments.colony else "swim")
-    )
+    name = "colony" if arguments.colony else individual_name(arguments.individual) or "swim"
+    if arguments.ancestors is not None:
+        name = f"{name}-ancestors".removeprefix("swim-")
+    paths = None if out is None else _named_paths(out, kinds, name)
     folder = _run_folder(path)
     if paths is None and folder is not None:
-        name = individual_name(arguments.individual) or "swim"
-        if arguments.ancestors is not None:
-            name, kinds = f"{name}-ancestors".removeprefix("swim-"), kinds[:1]
-        if arguments.colony:
-            name, kinds = "colony", kinds[:1]
+        several = arguments.colony or arguments.ancestors is not None
+        kinds = kinds[:1] if several else kinds
         paths = _paths_in(folder, name, kinds)
     check_episode_path(path)
     check_colony_arguments(arguments)

@@ -16,6 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.params import apply_overrides, check_overrides, multiply_factors
 from mjx_revolve.body.placement import Module
@@ -79,25 +81,34 @@ def correct_modules(tree: tuple[Module, ...], entries: Entries, source: str) -> 
     Raises:
         InputError: an entry is of no module.
     """
-    known = {ALL, *(m.type for m in tree), *(m.name for m in tree)}
+    known = {ALL, *(name for m in tree for name in (m.type, *m.kind.aliases, m.name))}
     for name in entries:
         if name not in known:
             raise InputError(
                 f"{source}: modules.{name}: expected `all`, a type or a module of this robot "
                 f"({', '.join(sorted(known - {ALL}))}); found none of this name"
             )
-    return tuple(_correct(module, entries) for module in tree)
+    return tuple(_correct(module, entries, source) for module in tree)
 
 
-def _correct(module: Module, entries: Entries) -> Module:
+def _correct(module: Module, entries: Entries, source: str) -> Module:
     kind, params = module.kind, dict(module.params)
-    for name in (ALL, module.type, module.name):
+    # A module may be named after its type.
+    for name in dict.fromkeys((ALL, module.type, *kind.aliases, module.name)):
         entry = _suited(entries.get(name, {}), kind)
         if not entry:
             continue
         kind = apply_overrides(kind, entry)
         before, more = params.get("factors", {}), entry.get("factors", {})
+        ballast = params.get("ballast", 0.0)
+        if ballast and "ballast" in entry and "ballast_position" in params | entry:
+            raise InputError(
+                f"{source}: modules.{name}.ballast: expected none, as {module.name} has its own "
+                f"in a place of its own; found {entry['ballast']:g}"
+            )
         params |= entry
+        if "ballast" in entry:  # which adds to the mass
+            params["ballast"] += ballast
         if before or more:
             both = {k: multiply_factors(x, before.get(k, 1.0)) for k, x in more.items()}
             params["factors"] = before | both
@@ -113,6 +124,8 @@ def _suited(entry: Mapping[str, object], kind: ModuleType) -> dict[str, Any]:
 def read_morphology_files(path: str | Path) -> dict[str, bytes]:
     """A morphology's file, and the coefficients that it names, by paths relative to its folder.
 
+    Coefficients that lie elsewhere are put beside the file, which then names them there.
+
     Raises:
         InputError: one cannot be read.
     """
@@ -120,6 +133,11 @@ def read_morphology_files(path: str | Path) -> dict[str, bytes]:
     found = {path.name: read_file(path)}
     data = parse_yaml(found[path.name], path)
     named = data.get("coefficients") if isinstance(data, dict) else None
-    if isinstance(named, str) and not Path(named).is_absolute() and ".." not in Path(named).parts:
-        found[named] = read_file(path.parent / named)
-    return found
+    if not isinstance(named, str) or not named:
+        return found
+    content, beside = read_file(path.parent / named), Path(named)
+    if beside.is_absolute() or ".." in beside.parts:
+        beside = Path(beside.name if beside.name != path.name else f"coefficients_{beside.name}")
+        data["coefficients"] = beside.name
+        found[path.name] = yaml.safe_dump(data, sort_keys=False, allow_unicode=True).encode()
+    return found | {beside.as_posix(): content}

@@ -244,7 +244,7 @@ def make_neural_network(plant: Plant, body: Morphology, source: str = "robot") -
     types = [neurons[k].type for k in moving]
     row_of = {neurons[k].id: row for row, k in enumerate(moving)}
     inputs = _find_inputs(network, body, place)
-    outputs = _find_outputs(network, body, plant, row_of, place)
+    outputs = _find_outputs(network, plant, row_of, place)
     changing = _genes_of(network)
     sources = [*(neurons[k].id for k, _ in inputs), *row_of]
     column_of = {name: column for column, name in enumerate(sources)}
@@ -358,7 +358,7 @@ def _find_inputs(
 
 
 def _find_outputs(
-    network: NeuralNetwork, body: Morphology, plant: Plant, row_of: Mapping[str, int], place: str
+    network: NeuralNetwork, plant: Plant, row_of: Mapping[str, int], place: str
 ) -> list[int | None]:
     """The neuron of each row of the plant."""
     driven: dict[int, int] = {}

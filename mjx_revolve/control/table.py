@@ -28,15 +28,16 @@ class ControllerKind(NamedTuple):
         return getattr(import_module(f"mjx_revolve.control.{module}"), name)
 
 
-_NETWORK = "joint_network.make_joint_network", ("sensors", "hidden", "messages")
+_WAVES = "max_frequency", "amplitude"
+_NETWORK = "joint_network.make_joint_network", (*_WAVES, "sensors", "hidden", "messages")
 CONTROLLERS: dict[str, ControllerKind] = {
-    "cpg": ControllerKind("cpg.make_cpg"),
-    "sine": ControllerKind("sine.make_sine", ("harmonics",)),
+    "cpg": ControllerKind("cpg.make_cpg", _WAVES),
+    "sine": ControllerKind("sine.make_sine", (*_WAVES, "harmonics")),
     "feedback": ControllerKind("feedback.make_feedback", ("gain", "depth")),
     "mlp": ControllerKind(*_NETWORK),
     "rnn": ControllerKind(*_NETWORK, {"recurrent": True}),
-    "sensory_cpg": ControllerKind("sensory_cpg.make_sensory_cpg", ("sensors", "gain")),
-    "splines": ControllerKind("splines.make_splines", ("points",)),
-    "brain": ControllerKind("neurons.make_neural_network", ("points",)),
+    "sensory_cpg": ControllerKind("sensory_cpg.make_sensory_cpg", (*_WAVES, "sensors", "gain")),
+    "splines": ControllerKind("splines.make_splines", (*_WAVES, "points")),
+    "brain": ControllerKind("neurons.make_neural_network", (*_WAVES, "points")),
 }
 """`brain` runs what the robot's own file has, a network or splines."""

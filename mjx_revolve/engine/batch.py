@@ -545,8 +545,10 @@ def _pick_rows(
 ) -> tuple[Level, Level, np.ndarray]:
     """Roots `[1, R]` and rows `[rows, 1, R]` of R robots; `[2, meetings, R]` pairs of shells."""
     count, rows = len(assembly.roots), capacity.rows
-    body = np.zeros((rows, count), int)
-    body[order.place, order.robot] = np.where(order.overflow, 0, order.body)
+    whole = np.zeros((rows, count), int)
+    whole[order.place, order.robot] = order.body
+    body = whole.copy()
+    body[order.place[order.overflow], order.robot[order.overflow]] = 0
 
     def place(
         which: np.ndarray, held: np.ndarray, piece: np.ndarray, rank: np.ndarray,
@@ -602,7 +604,7 @@ def _pick_rows(
     root = select_bodies(
         alike, assembly.roots, root_parts, root_points, root_shells, True, 1, finish
     )
-    level = select_bodies(alike, body, parts, points, shells, False, 1, finish)
+    level = select_bodies(alike, body, parts, points, shells, False, 1, finish, whole)
     return root, level, met
 
 
@@ -760,7 +762,15 @@ def _check_fit(
             raise InputError(
                 f"robot {names[k]!r}: expected at most {most} {what}; found {counts[k]}"
             )
-    points, root_points = _count_points(assembly, order) if capacity.root_points else (0, 0)
+    whole = isinstance(find_drag_law(assembly.world.drag), BodyDragLaw)
+    if whole and np.any(order.overflow):
+        k = int(np.argmax(order.overflow))
+        raise InputError(
+            f"robot {names[order.robot[k]]!r}: expected at most as many parts on a body as the "
+            f"examples have, as {assembly.world.drag} drags bodies as a whole; found more"
+        )
+    touches = capacity.points or capacity.root_points
+    points, root_points = _count_points(assembly, order) if touches else (0, 0)
     if points > capacity.points or root_points > capacity.root_points:
         raise InputError(
             f"robots: expected at most {capacity.points} contact points in a row and "

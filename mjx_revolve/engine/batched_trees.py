@@ -124,11 +124,6 @@ class BatchedTrees:
         return self.capacity.carries
 
     @property
-    def alike(self) -> bool:
-        """Whether the tables hold one robot."""
-        return self.bodies.alike
-
-    @property
     def meets(self) -> bool:
         """Whether any boxes of a robot can meet."""
         return self.met is not None

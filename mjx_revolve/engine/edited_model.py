@@ -14,7 +14,11 @@ from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.spatial import Scalar, quat_to_matrix
 
 # What an edit must leave as it is: the tables of water and contact follow from it.
-_FIXED = ("body_parentid", "body_pos", "body_quat", "body_jntadr", "jnt_pos", "jnt_axis")
+_FIXED = (
+    *("body_parentid", "body_pos", "body_quat", "body_jntadr", "jnt_pos", "jnt_axis"),
+    # Forces that our step does not have.
+    *("jnt_stiffness", "dof_frictionloss", "actuator_gear", "qpos_spring", "body_gravcomp"),
+)
 _COUNTS = ("nbody", "nq", "nv", "nu")
 
 
@@ -43,13 +47,18 @@ def check_edit(model: mujoco.MjModel, built: mujoco.MjModel, name: str) -> None:
 
 
 def edited_assembly(assembly: Assembly, model: mujoco.MjModel) -> Assembly:
-    """An assembly of one robot with the masses and inertias of a model."""
+    """An assembly of one robot with the masses, inertias and hinges' ranges of a model."""
     axes = quat_to_matrix(model.body_iquat)
+    joint, reach = model.body_jntadr[2:], assembly.range.copy()
+    # Where a hinge without a limit meets its neighbours is looked for within a turn.
+    turn = _limits(model.jnt_range[joint], model.jnt_limited[joint])
+    reach[2:] = np.clip(turn, -np.pi, np.pi)
     return replace(
         assembly,
         mass=model.body_mass.copy(),
         center=model.body_ipos.copy(),
         inertia=np.einsum("bij,bj,bkj->bik", axes, model.body_inertia, axes),
+        range=reach,
     )
 
 
@@ -59,7 +68,7 @@ def edited_constants(
     """The constants of one robot with the hinges and servos of a model.
 
     Args:
-        constants: as built.
+        constants: of the assembly with the model's masses and ranges.
         model: the edited one.
         servos: its actuators that turn hinges.
 
@@ -74,7 +83,9 @@ def edited_constants(
     dof = model.jnt_dofadr[joint]
     effort = _limits(model.actuator_forcerange[act], model.actuator_forcelimited[act])
     target = _limits(model.actuator_ctrlrange[act], model.actuator_ctrllimited[act])
-    limits = _limits(model.jnt_range[joint], model.jnt_limited[joint])
+    free = ~model.jnt_limited[joint].astype(bool)
+    stops = np.stack([np.asarray(x, float)[2:] for x in constants.hinges.range], 1)
+    limits = np.where(free[:, None], [-np.inf, np.inf], stops)
     strong = np.where(np.isfinite(effort[:, 1]), effort[:, 1], 1.0)
     motor = motor_line(model.jnt_user[joint, 0], effort[:, 1], model.dof_damping[dof])
 

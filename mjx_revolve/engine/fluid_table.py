@@ -119,12 +119,12 @@ def drag_law(part: Part, world: World) -> str:
     """The name of a part's drag law: its own, that of its fin, or the world's.
 
     A world without drag has none for any part. MuJoCo's laws are for all parts, fins and parts with
-    a damping of their own included. Under the drag law for flow across chains, thin parts and fins
-    have laws with a memory of their wakes.
+    a damping of their own included; that of whole bodies for parts with another law, too. Under the
+    drag law for flow across chains, thin parts and fins have laws with a memory of their wakes.
     """
-    if world.drag == "off":
-        return "off"
-    if part.drag is not None or world.drag in (INERTIA_BOX.name, ELLIPSOID.name):
+    if world.drag in ("off", INERTIA_BOX.name):
+        return world.drag
+    if part.drag is not None or world.drag == ELLIPSOID.name:
         return part.drag or world.drag
     if part.fossen is not None:
         return "fossen"

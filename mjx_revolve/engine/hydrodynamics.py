@@ -587,39 +587,25 @@ def implicit_share(
 ) -> Scalar:
     """Which share of the drag a step takes implicitly, `[nbody, lanes]` in 0 to 1 [-].
 
-    min(1, z²) with z = dt G / m, where G = Σ g ρ A v bounds the gradient of the drag: over the
-    parts, with the largest face A, the speed v of the fastest corner through the water, and the
-    law's `steepest` g.
+    min(1, z²) with z = dt G / m, where G bounds the gradient of the drag. Of a part it is g ρ A v,
+    with the largest face A, the law's `steepest` g and the speed v of its fastest corner through
+    the water, at most that of its centre and |ω| half its diagonal. Of all parts together,
+    Σ s v ≤ √(Σ s · Σ s v²) with s = g ρ A: so it follows from sums over the body, see `DragBound`.
     An extrapolated force is stable for gradients up to m / (dt (1 - z²)), which is 2.6 G or more.
     1 in motion without such a bound, and with MuJoCo's laws, which are explicit as in MuJoCo.
     """
-    w, gradient, mass = motion.angular_velocity, 0.0, add(level.mass, 1e-12)
-    for parts in level.parts:
-        if not is_present(parts.steep):
-            continue
-        corner = mul(_length(parts.half_size), safe_norm(w))
-        velocity = vadd(motion.velocity, cross(w, parts.position))
-        stream = _stream(world, water, motion, parts.position).velocity
-        speed = safe_norm(velocity if stream is None else vsub(velocity, stream))
-        speed = add(speed, corner)
-        gradient = add(gradient, sum_parts(mul(parts.steep, speed), parts.count))
-        if parts.carried is not None:
-            x, y, z = parts.carried.mass
-            mass = add(mass, sum_parts(_least(_least(x, y), z), parts.count))
-    if isinstance(gradient, float):
+    bound, w = level.bound, motion.angular_velocity
+    if not is_present(bound.steep):
         return 0.0
-    ratio = dt * gradient / mass
+    stream = _stream(world, water, motion, _ZERO).velocity
+    v = motion.velocity if stream is None else vsub(motion.velocity, stream)
+    # Σ s |v + ω × x|²
+    turning = add(mul(2.0, dot(v, cross(w, bound.moment))), dot(w, symvec(bound.inertia, w)))
+    square = mul(bound.steep, add(mul(bound.steep, dot(v, v)), turning))
+    # Not below 0 by rounding, and with a gradient at rest.
+    gradient = add(jnp.sqrt(jnp.maximum(square, 1e-30)), mul(bound.corners, safe_norm(w)))
+    ratio = dt * gradient / add(bound.mass, 1e-12)
     return jnp.minimum(ratio * ratio, 1)
-
-
-def _length(a: Vec) -> Scalar:
-    square = dot(a, a)
-    return jnp.sqrt(square) if isinstance(square, jax.Array) else np.sqrt(square)
-
-
-def _least(a: Scalar, b: Scalar) -> Scalar:
-    traced = isinstance(a, jax.Array) or isinstance(b, jax.Array)
-    return jnp.minimum(a, b) if traced else np.minimum(a, b)
 
 
 def water_forces(

@@ -29,7 +29,28 @@ from mjx_revolve.water.laws import PartDragLaw, law_numbers, part_field
 _SHAPE = "the robot's shape, which is known"
 _MEASURED = "thrusters keep their curves, which are measured"
 _INSIDE = "its own fields say"
-_BOUND = "a bound, with a margin"
+
+
+class DragBound(NamedTuple):
+    """Sums over all parts of a body, which bound the gradient of its drag; body frame.
+
+    They belong to the body as a whole, however its parts are shared out among rows. No factor of
+    `Variation` multiplies them: bounds have a margin.
+
+    Attributes:
+        steep: Σ s of the parts' s, bounds of the gradient over the speed [kg/m]; next to endless
+            without a bound and with explicit laws.
+        moment: Σ s x with the centres x of the parts' boxes [kg].
+        inertia: Σ s (x² 1 - x xᵀ) [kg·m].
+        corners: Σ s r with half the diagonals r of the boxes [kg].
+        mass: of the body, with the least that the water which its parts carry weighs [kg].
+    """
+
+    steep: Scalar
+    moment: Vec
+    inertia: Sym
+    corners: Scalar
+    mass: Scalar
 
 
 class PartLaws(NamedTuple):
@@ -153,8 +174,6 @@ class Parts:
         half_size: half edges of the box [m].
         center_position: centre of the displaced volume [m].
         volume: displaced [m³].
-        steep: bound of the drag's gradient over the speed [kg/m], less where it acts on a thin
-            part's water; next to endless without a bound and with explicit laws.
         bulk: volume of the box [m³], for drag laws of whole bodies.
         exposed: share of each pair of faces that the water reaches [-], for surface tension.
         drag: numbers of their drag law; in `StepConstants`, those of all laws by name.
@@ -169,7 +188,6 @@ class Parts:
     half_size: Vec = part_field("m", axes="size", blank=1.0, fixed=_SHAPE)
     center_position: Vec = part_field("m", fixed=_SHAPE)
     volume: Scalar = part_field("m3", varied=("density",))
-    steep: Scalar = part_field("kg/m", fixed=_BOUND)
     bulk: Any = part_field("m3", fixed=_SHAPE, default=None)
     exposed: Any = part_field("-", axes="size", fixed=_SHAPE, default=None)
     drag: Any = part_field("-", fixed=_INSIDE, default=None)
@@ -229,7 +247,17 @@ class Shells:
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["hinges", "mass", "moment", "inertia", "box", "parts", "points", "shells"],
+    data_fields=[
+        "hinges",
+        "mass",
+        "moment",
+        "inertia",
+        "box",
+        "bound",
+        "parts",
+        "points",
+        "shells",
+    ],
     meta_fields=["count"],
 )
 @dataclass(frozen=True)
@@ -243,6 +271,7 @@ class Level:
         moment: mass times centre of mass, body frame [kg·m].
         inertia: about the body's origin [kg·m²].
         box: for MuJoCo's inertia-box law, else None.
+        bound: of the drag's gradient.
         parts: what the water acts on, in groups that obey the same laws.
         points: what may touch the bed, or None.
         shells: what may meet other bodies of the same robot, or None.
@@ -254,6 +283,7 @@ class Level:
     moment: Vec
     inertia: Sym
     box: InertiaBox | None
+    bound: DragBound
     parts: tuple[Parts, ...]
     points: Points | None
     shells: Shells | None = None

@@ -42,6 +42,7 @@ class BodyGeometry(NamedTuple):
             at rest, core frame: it points up when the body is in equilibrium in deep water.
             (0, 0, 1) if the two coincide.
         center: `[3]` or `[3, lanes]` centre of mass at rest, core frame [m].
+        thrust: of all thrusters together, at full command [N].
     """
 
     length: Any
@@ -53,6 +54,7 @@ class BodyGeometry(NamedTuple):
     num_hinges: Any
     up: Any
     center: Any
+    thrust: Any
 
 
 def body_geometry(robot: Robot) -> BodyGeometry:
@@ -76,6 +78,7 @@ def body_geometries(assembly: Assembly) -> BodyGeometry:
     arm = np.linalg.norm(lever, axis=1, keepdims=True)
     hangs = arm > _ONE_POINT
     displaced = world.density * np.bincount(layout.body, table.volume)
+    thrust = [p.thruster.largest_thrust if p.thruster else 0.0 for p in assembly.thruster_part]
     return BodyGeometry(
         length=extent.max(1),
         stretched=np.maximum(extent.max(1), stretched_lengths(assembly)),
@@ -86,6 +89,7 @@ def body_geometries(assembly: Assembly) -> BodyGeometry:
         num_hinges=np.array([float(body.num_hinges) for body in assembly.morphologies]),
         up=np.where(hangs, lever / np.where(hangs, arm, 1.0), (0.0, 0.0, 1.0)).T,
         center=heavy.T,
+        thrust=np.bincount(layout.body[assembly.thruster_row], np.array(thrust, float), robots),
     )
 
 

@@ -74,8 +74,6 @@ class SingleTree:
         """The root's level and those below."""
         return (self.root, *self.below)
 
-    alike = True
-
     @property
     def meets(self) -> bool:
         """Whether any of its modules can meet."""

@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 import jax
 import mujoco
 import numpy as np
-from jaxtyping import Float
 
 from mjx_revolve.body.placement import counted, turned
 from mjx_revolve.engine.assembly import Assembly
 from mjx_revolve.engine.fluid_table import FluidTable
 from mjx_revolve.engine.level import (
+    DragBound,
     Hinges,
     InertiaBox,
     Level,
@@ -64,6 +64,7 @@ class StepConstants(NamedTuple):
     Attributes:
         hinges: `[nbody]`, by the moving bodies; 0, the world, is nothing, and so is a root's.
         bodies: `[nbody]` mass, moment and inertia, and the inertia box or None.
+        bounds: `[nbody]` of the drag's gradient.
         parts: `[npart + 1]` a `Parts` of all laws, in the order of the fluid table.
         points: `[npoint + 1]` (position, mass share), or None without a bed.
         laws: those that parts obey, in order.
@@ -75,6 +76,7 @@ class StepConstants(NamedTuple):
 
     hinges: Hinges
     bodies: tuple[Any, ...]
+    bounds: DragBound
     parts: Parts
     points: Any
     laws: tuple[PartLaws, ...]
@@ -157,10 +159,17 @@ def read_constants(assembly: Assembly, pairs: np.ndarray = _NO_PAIRS) -> StepCon
     each = list(zip(*columns, strict=True))
     laws = sorted(set(each))
     number = {law: k for k, law in enumerate(laws)}
+    drags = {name: find_drag_law(name) for name in sorted({*table.drag})}
+    numbers = {
+        name: part_numbers(law, table, assembly.world)
+        for name, law in drags.items()
+        if isinstance(law, PartDragLaw)
+    }
     return StepConstants(
         hinges=_read_hinges(assembly, frame, pairs),
         bodies=_read_bodies(assembly, frame),
-        parts=_read_parts(assembly, frame),
+        bounds=_read_bounds(assembly, frame, drags, numbers),
+        parts=_read_parts(assembly, frame, numbers),
         points=points,
         laws=tuple(PartLaws(*law) for law in laws),
         part_laws=np.array([number[law] for law in each]),
@@ -316,15 +325,18 @@ def _principal(assembly: Assembly) -> tuple[np.ndarray, np.ndarray]:
 _UNBOUNDED = 1e9
 
 
-def _steepness(
-    assembly: Assembly, laws: Mapping[str, DragLaw], numbers: Mapping[str, Any]
-) -> Float[np.ndarray, " npart"]:
-    """How steep each part's drag is at most, see `Parts.steep`: g ρ A with the largest face A.
+def _read_bounds(
+    assembly: Assembly,
+    frame: np.ndarray,
+    laws: Mapping[str, DragLaw],
+    numbers: Mapping[str, Any],
+) -> DragBound:
+    """Bounds of the gradient of each body's drag: each part's is g ρ A v, with the largest face A.
 
     What drags a thin part acts across it, where it carries far more water than any other way. As
     the step compares all drag with what a body carries at least, that of thin parts counts less.
     """
-    table, density = assembly.fluid, assembly.world.density
+    table, density, mass = assembly.fluid, assembly.world.density, assembly.mass
     x, y, z = 2 * table.half_size.T
     face, steep = np.max([x * y, y * z, z * x], 0), np.empty(len(x))
     for name, law in laws.items():
@@ -337,12 +349,27 @@ def _steepness(
     if table.carries:
         least, across = density * table.carried_mass.min(-1), table.half_size.argmin(-1)
         more = density * table.carried_mass[np.arange(len(x)), across] - least
-        mass = (assembly.mass + np.bincount(table.body, least, len(assembly.mass)))[table.body]
-        steep *= mass / (mass + thinness(2 * table.half_size) * more)
-    return steep
+        mass = mass + np.bincount(table.body, least, len(mass))
+        whole = mass[table.body]
+        steep *= whole / (whole + thinness(2 * table.half_size) * more)
+    at = turned(frame[table.body].swapaxes(1, 2), table.position)
+    x = _skews(at)
+
+    def total(each: np.ndarray) -> np.ndarray:
+        found = np.zeros((len(mass), *each.shape[1:]))
+        np.add.at(found, table.body, each)
+        return found
+
+    return DragBound(
+        steep=total(steep),
+        moment=_vec(total(steep[:, None] * at)),
+        inertia=_sym(total(-steep[:, None, None] * (x @ x))),
+        corners=total(steep * np.linalg.norm(table.half_size, axis=1)),
+        mass=mass,
+    )
 
 
-def _read_parts(assembly: Assembly, frame: np.ndarray) -> Parts:
+def _read_parts(assembly: Assembly, frame: np.ndarray, drag: Mapping[str, Any]) -> Parts:
     """All parts, with the numbers of every law that any of them obeys."""
     table, world = assembly.fluid, assembly.world
     back = frame[table.body].swapaxes(1, 2)
@@ -351,20 +378,13 @@ def _read_parts(assembly: Assembly, frame: np.ndarray) -> Parts:
     # The part's axes in the frame that describes it: the body's where both have the same.
     square = np.all((turn == 0) | (np.abs(turn) == 1), (1, 2))
     swap = np.where(square[:, None, None], turn, np.eye(3))
-    laws = {name: find_drag_law(name) for name in sorted({*table.drag})}
     whole = isinstance(find_drag_law(world.drag), BodyDragLaw)
-    drag = {
-        name: part_numbers(law, table, world)
-        for name, law in laws.items()
-        if isinstance(law, PartDragLaw)
-    }
     numbers: dict[str, Any] = dict(
         position=position,
         rotation=turn @ swap.swapaxes(1, 2),
         half_size=table.half_size,
         center_position=position + turned(turn, table.center_of_volume),
         volume=table.volume,
-        steep=_steepness(assembly, laws, drag),
         bulk=8 * table.half_size.prod(-1) if whole else None,
         exposed=table.exposed if world.surface_tension else None,
         drag=drag,
@@ -448,6 +468,7 @@ def select_bodies(
     root: bool,
     count: int,
     finish: Any,
+    owners: np.ndarray | None = None,
 ) -> Level:
     """The constants of some bodies.
 
@@ -461,6 +482,7 @@ def select_bodies(
         root: whether they are roots, which no hinge carries.
         count: how many bodies move together.
         finish: what becomes of each picked array.
+        owners: which bodies the parts belong to; by default `bodies`.
 
     Returns:
         The level.
@@ -498,6 +520,7 @@ def select_bodies(
         moment=moment,
         inertia=inertia,
         box=box,
+        bound=jax.tree.map(take(bodies if owners is None else owners), columns.bounds),
         parts=tuple(groups),
         points=touching,
         shells=boxes,

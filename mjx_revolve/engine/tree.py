@@ -39,10 +39,6 @@ class Tree(Protocol):
         """Whether any part has added mass."""
 
     @property
-    def alike(self) -> bool:
-        """Whether all lanes are the same robot."""
-
-    @property
     def meets(self) -> bool:
         """Whether boxes of one robot can meet."""
 

@@ -159,9 +159,11 @@ class ControllerConfig(Section):
     @model_validator(mode="after")
     def _check(self) -> ControllerConfig:
         self.refuse_params(self.params)
-        slow = self.rate is not None and self.max_frequency > self.rate / 2
+        times = self.harmonics if self.type == "sine" else 1
+        slow = self.rate is not None and times * self.max_frequency > self.rate / 2
         if slow and self.type not in ("feedback", "brain") and not self.is_user_code:
             most = f"at most half of controller.rate ({self.rate:g} Hz), to be sampled by it"
+            most += f", of the last of {times} harmonics" if times > 1 else ""
             raise ConstraintError("max_frequency", most, f"{self.max_frequency:g}")
         for name in dict.fromkeys(x for kind in CONTROLLERS.values() for x in kind.settings):
             kinds = [key for key, kind in CONTROLLERS.items() if name in kind.settings]
@@ -317,13 +319,28 @@ class TaskConfig(Section):
         if self.target_turn is not None and not found:
             what = "three numbers [m], or target_distance, as there is a target_turn"
             raise ConstraintError("target", what, "none")
-        if self.course_spread is None and (self.course_changes or self.course_rate):
-            name = "course_changes" if self.course_changes else "course_rate"
-            what = "0, as there is no course without a course_spread"
-            raise ConstraintError(name, what, show(getattr(self, name)))
-        if self.course_spread is not None and math.hypot(*self.direction[:2]) < 1e-9:
-            what = "one that is not upright, as there is a course_spread, which is level"
-            raise ConstraintError("direction", what, show(list(self.direction)))
+        needed = {
+            "target_speed": ("target or target_distance", found),
+            "target_spread": ("target_distance", self.target_distance),
+            "sight": ("target or target_distance", found),
+            "course_changes": ("course_spread", self.course_spread),
+            "course_rate": ("course_spread", self.course_spread),
+            "course_turn": ("course_changes", self.course_changes),
+        }
+        for name, (other, given) in needed.items():
+            usual, value = type(self).model_fields[name].default, getattr(self, name)
+            if not given and value != usual:
+                what = "none" if usual is None else f"{usual:g}"
+                raise ConstraintError(name, f"{what}, as there is no {other}", f"{value:g}")
+        level = {
+            "a course_spread": self.course_spread is not None,
+            "a horizon": self.horizon is not None and self.type == "directed_swim",
+            f"task.type {self.type}": self.type == "hold_heading",
+        }
+        for name in (name for name, needs in level.items() if needs):
+            if math.hypot(*self.direction[:2]) < 1e-9:
+                what = f"one that is not upright, as there is {name}, which is level"
+                raise ConstraintError("direction", what, show(list(self.direction)))
         if math.hypot(*self.direction) < 1e-9:
             raise ConstraintError(
                 "direction", "a vector of some length", show(list(self.direction))
@@ -413,10 +430,10 @@ class Config(Settings):
         if self.evolution.passport == "required":
             what = "true or false, as bodies evolve (bodies.selection.passport asks for it)"
             raise ConstraintError("evolution.passport", what, "required")
-        for name in ("strategy", "strategy_params"):
+        for name in ("strategy", "strategy_params", "std_init"):
             usual, found = EvolutionConfig.model_fields[name].default, getattr(self.evolution, name)
             if found != usual:
-                what = f"{usual!r}, as bodies evolve (see bodies.selection and bodies.learning)"
+                what = f"{usual!r}, as bodies evolve (see bodies.selection, .learning and .brains)"
                 raise ConstraintError(f"evolution.{name}", what, repr(found))
         return self
 
@@ -476,7 +493,8 @@ class Config(Settings):
 
     def for_body(self, morphology: str | Path) -> Config:
         """The configuration for the evolution of one body's brain, given a morphology's path."""
-        return self.model_copy(update={"morphology": str(morphology), "bodies": None})
+        none = {"bodies": None, "colony": None}
+        return self.model_copy(update={"morphology": str(morphology)} | none)
 
     @property
     def world_name(self) -> str:

@@ -187,7 +187,8 @@ class EpisodeSpec(ABC, Generic[B]):
         """
         shape, count = np.shape(population), self.num_genes
         if len(shape) in ranks and shape[-1] == count and 0 not in shape:
-            return jnp.asarray(population)
+            genes = jnp.asarray(population)
+            return genes if jnp.issubdtype(genes.dtype, jnp.floating) else genes.astype(float)
         if count == 0:
             raise InputError(
                 "population: expected bodies with a hinge or a thruster to control; found none, "
@@ -366,6 +367,10 @@ class EpisodeSpec(ABC, Generic[B]):
         Returns:
             The scores, 0 until the settling time is over; and whether the rollouts are sane.
         """
+        if "target" in self.task.records and "target" not in track and context.target is not None:
+            # What drifts stands from now on, too.
+            time = self._record_times(track["position"].dtype, -(-clock // self.record_every))
+            track = dict(track) | {"target": target_path(context, time)}
         found = self.score(track, position, geometry, context)
         first = first_scored_row(self.settings, self.world.timestep)
         counts = clock >= (first + 1) * self.record_every
@@ -406,8 +411,7 @@ class EpisodeSpec(ABC, Generic[B]):
         self, track: dict[str, jax.Array], context: EpisodeContext
     ) -> dict[str, jax.Array]:
         """A track with the paths of target and course, if the task records them."""
-        interval = self.record_every * self.world.timestep
-        time = interval * jnp.arange(1, self.num_records + 1, dtype=track["position"].dtype)
+        time = self._record_times(track["position"].dtype)
         track = dict(track)
         if "target" not in self.task.records:
             track.pop("target", None)
@@ -416,6 +420,13 @@ class EpisodeSpec(ABC, Generic[B]):
         if "course" in self.task.records and context.course is not None:
             track["course"] = course_path(context.course, time)
         return track
+
+    def _record_times(self, dtype: Any, last: jax.Array | None = None) -> jax.Array:
+        """`[S]` times of the rows [s]; `[S, lanes]` up to the last row of each lane."""
+        row = jnp.arange(1, self.num_records + 1, dtype=dtype)
+        if last is not None:
+            row = jnp.minimum(row.reshape(-1, *[1] * last.ndim), last.astype(dtype))
+        return self.record_every * self.world.timestep * row
 
 
 def widen(now: RolloutState) -> RolloutState:

@@ -52,8 +52,8 @@ from mjx_revolve.episodes.named_files import read_modules, read_morphology, read
 from mjx_revolve.episodes.rollout import RolloutState, with_variation
 from mjx_revolve.episodes.scoring import average_trials, list_episodes, max_distance, may_touch_bed
 from mjx_revolve.episodes.simulate import Trajectory, simulate
-from mjx_revolve.episodes.starts import Starts, episode_context, pick_water
-from mjx_revolve.episodes.tasks import Task, find_task
+from mjx_revolve.episodes.starts import Starts, episode_context, pick_water, target_path
+from mjx_revolve.episodes.tasks import TASKS, Task, find_task
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.xla import materialize, over_chunks
 from mjx_revolve.water.drag import DRAG_LAWS, find_drag_law
@@ -448,8 +448,12 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
                         row["target"] = jnp.stack(now.memory.pursuer.position)
                     return row
 
-                rows = self.num_timesteps // every
-                return chunk.rollout.advance(chunk.state, record, rows, every, chunk.inputs)[1]
+                count, context = self.num_timesteps // every, chunk.rollout.context
+                rows = chunk.rollout.advance(chunk.state, record, count, every, chunk.inputs)[1]
+                if context.target is not None and "target" not in rows:
+                    time = every * self.world.timestep * jnp.arange(1, count + 1)
+                    rows["target"] = target_path(context, time.astype(rows["energy"].dtype))
+                return rows
 
             return over_chunks(trace)(jnp.arange(len(population), dtype=jnp.int32), trial)
 
@@ -604,7 +608,11 @@ def make_mixed_fitness(
         longest = modules * max(_diagonal(kind) for kind in types.values())
         heavy = any(world.density * kind.volume < kind.mass / 2 for kind in types.values())
         sinks = world.buoyancy == "off" or (heavy and config.trim != "neutral")
-        figures.append(figures[0]._replace(length=longest, sinks=sinks))
+        thrust = modules * max(
+            sum(p.thruster.largest_thrust for p in kind.parts if p.thruster is not None)
+            for kind in types.values()
+        )
+        figures.append(figures[0]._replace(length=longest, sinks=sinks, thrust=thrust))
     reach = max(max_distance(config.task, world, figure) for figure in figures)
     touches = may_touch_bed(task, config.task, world, reach)
     if config.colony is not None:  # in a long life a robot may get anywhere
@@ -744,6 +752,12 @@ def _find_controller(
     example: Plant | None = None,
 ) -> Controller:
     if settings.depth is None:
+        task = TASKS.get(config.task.type)
+        if settings.type == "feedback" and task is not None and task.on_bed:
+            raise InputError(
+                f"{config.origin('controller.depth')}controller.depth: expected a depth [m], as "
+                f"{config.task.type} does not start at task.depth; found none"
+            )
         settings = settings.model_copy(update={"depth": config.task.depth})
     try:
         return find_controller(plant, settings, config.source, example, body)

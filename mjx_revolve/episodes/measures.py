@@ -19,7 +19,7 @@ _FINER = 8
 # Joints that swing less than this do not move [rad].
 _STILL = 0.01
 # Phases of which less than this is left when they are added up are spread all round.
-_MIN_BED_SHARE = 1e-3
+_MIN_SHARE = 1e-3
 # A robot that the bed bears with less than this share of its weight does not touch it.
 _TOUCH = 1e-3
 
@@ -127,7 +127,7 @@ def _gait(track: Track) -> dict[str, jax.Array]:
     v = jnp.sum(waves * jnp.cos(turn)[:, None], 0)
     whole = jnp.sum(jnp.hypot(u, v), 0)
     left = jnp.hypot(jnp.sum(u, 0), jnp.sum(v, 0)) / jnp.maximum(whole, 1e-9)
-    spread = jnp.sqrt(-2 * jnp.log(jnp.clip(left, _MIN_BED_SHARE, 1.0)))
+    spread = jnp.sqrt(-2 * jnp.log(jnp.clip(left, _MIN_SHARE, 1.0)))
     lag = jnp.arctan2(
         jnp.sum(v[:-1] * u[1:] - u[:-1] * v[1:], 0), jnp.sum(u[:-1] * u[1:] + v[:-1] * v[1:], 0)
     )

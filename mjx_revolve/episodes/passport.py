@@ -29,10 +29,11 @@ from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.self_overlap import self_overlap
 from mjx_revolve.engine.variation import Variation
-from mjx_revolve.episodes.evaluation import Chunk, task_recorder
+from mjx_revolve.episodes.evaluation import Chunk, as_precise, task_recorder
 from mjx_revolve.episodes.fitness import Fitness, fit_body
 from mjx_revolve.episodes.scoring import PASSPORT_STREAM, replay_key
 from mjx_revolve.episodes.simulate import Trajectory
+from mjx_revolve.episodes.starts import Starts, draw_gusts
 from mjx_revolve.inputs.errors import reading
 from mjx_revolve.inputs.schema import Text, checked, read
 from mjx_revolve.inputs.yaml_reader import load_yaml
@@ -40,6 +41,7 @@ from mjx_revolve.numerics.xla import over_chunks
 from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.drag import find_drag_law
 from mjx_revolve.water.flow import water_of
+from mjx_revolve.water.world import World
 
 PASSPORT = "champion/passport.yaml"
 """Its place in a run folder."""
@@ -227,9 +229,7 @@ def _swim(fitness: Fitness, genes: jax.Array, key: jax.Array) -> Iterator[tuple[
     with ThreadPoolExecutor(3) as threads:
         coarse = threads.submit(_scores, fitness, genes, key, _all_lanes(tried), True)
         fine = {
-            part: threads.submit(
-                _scores, _with_step(fitness, part), genes, key, few, False, part == 2
-            )
+            part: threads.submit(_scores, fitness, genes, key, few, False, part, part == 2)
             for part in (2, 4)
         }
         scores = coarse.result()
@@ -242,8 +242,8 @@ def _swim(fitness: Fitness, genes: jax.Array, key: jax.Array) -> Iterator[tuple[
         if not rates:
             return Check(f"score {words}", float(found.mean()), unit)
         share = float(found.mean() / of.mean()) if of.mean() > 0 else math.nan
-        if least is None:  # of what should have no score at all
-            return Check(f"share {words}", abs(share), most=BRAINLESS)
+        if least is None:  # of what should have no score at all; less is no gain
+            return Check(f"share {words}", max(share, 0.0), most=BRAINLESS)
         return Check(f"share {words}", share, least=least)
 
     yield "score", Check(f"score from {_STARTS} fresh starts", float(own.mean()), unit)
@@ -305,6 +305,7 @@ def _scores(
     key: jax.Array,
     lanes: _Lanes,
     long: bool,
+    part: int = 1,
     fast: bool = False,
 ) -> dict[float, np.ndarray]:
     """Scores of lanes after some times.
@@ -315,12 +316,14 @@ def _scores(
         key: draws the starts.
         lanes: what is tried.
         long: whether it swims longer than the task lasts.
+        part: how many steps there are for one of the world's.
         fast: whether the program is compiled in haste.
 
     Returns:
         `[lanes]` by time [s]: the task's duration first, then the longer ones.
     """
-    usual = fitness.config.task.duration
+    coarse, usual = fitness, fitness.config.task.duration
+    fitness = fitness if part == 1 else _with_step(fitness, part)
     times = [usual, *(t for t in (_MIDDLE, _LONG) if long and t > usual)]
 
     def spec(seconds: float) -> Fitness:
@@ -335,7 +338,7 @@ def _scores(
     whole = replace(specs[times[-1]], controller=_silenceable(fitness.controller))
 
     def run(genes: jax.Array, key: jax.Array) -> PyTree:
-        starts = whole.precise_starts(genes, key)
+        starts = as_precise(fresh_starts(whole, specs[usual], coarse.world, key), genes)
         starts = jax.tree.map(lambda x: x[..., lanes.start], starts)
         starts = starts._replace(variation=jax.tree.map(jnp.asarray, lanes.variation))
         population = jnp.stack([jnp.append(genes, active) for active in (0.0, 1.0)])
@@ -359,6 +362,26 @@ def _scores(
     program = fitness.keep(run, "passport", made_of, times, fast=fast)
     found = program(genes, key)
     return {seconds: np.asarray(x, float) for seconds, x in found.items()}
+
+
+def fresh_starts(whole: Fitness, usual: Fitness, world: World, key: jax.Array) -> Starts:
+    """The starts from which a champion is tried: the same for all times and steps.
+
+    Args:
+        whole: of the longest time, in steps that may be finer than the world's.
+        usual: of the task's duration, within which courses turn.
+        world: with the task's own step, for which gusts are drawn.
+        key: draws them.
+    """
+    starts = whole.draw_starts(key)._replace(course=usual.draw_starts(key).course)
+    if world.gust is None:
+        return starts
+    part = round(world.timestep / whole.world.timestep)
+    path = draw_gusts(world, key, whole.num_timesteps // part, whole.settings.trials)
+    rest = jnp.arange(part).reshape(-1, 1, 1) / part
+    between = path[:-1, None] * (1 - rest) + path[1:, None] * rest
+    gusts = jnp.concatenate([between.reshape(-1, *path.shape[1:]), path[-1:]])
+    return starts._replace(gusts=gusts)
 
 
 def _score(spec: Fitness, chunk: Chunk, track: dict[str, jax.Array]) -> jax.Array:

@@ -340,12 +340,14 @@ class Tank:
         controller, engine = self.mixed.controller, self._engine(given)
         parameters = controller.decode(given.genes, given.bodies.plant)
         target = None if given.target is None else tuple(given.target)
+        far = self.mixed.settings.sight
+        sight = None if far is None else jnp.full(given.noise.shape, far, given.genes.dtype)
         rollout = Rollout(
             engine,
             controlled(controller, parameters),
             self.world,
             Water(self.world.surface_height, tuple(given.current), time=given.time),
-            EpisodeContext(target, None, given.noise),
+            EpisodeContext(target, None, given.noise, sight),
             controller.signals,
             birth=given.since,
         )
@@ -451,5 +453,10 @@ def make_tank(
     if mixed.world.gust is not None:
         raise InputError(
             "tank: expected a world without gusts, which are drawn for episodes; found some"
+        )
+    if mixed.world.bed is not None and not mixed.touches:
+        raise InputError(
+            "tank: expected a fitness with a colony where there is a bed, which robots reach in a "
+            "long life; found one for episodes that end before"
         )
     return Tank(mixed, places * worlds, worlds, touch, spheres)

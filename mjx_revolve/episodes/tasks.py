@@ -206,6 +206,11 @@ def _counted(along: jax.Array, kept: jax.Array) -> jax.Array:
     return jnp.where(along > 0, kept, along)
 
 
+def _progress(track: Track, along: jax.Array, kept: jax.Array) -> jax.Array:
+    """What counts of ways along a direction, `[S - 1, lanes]` [m], as a speed [body lengths/s]."""
+    return jnp.sum(_counted(along, kept), 0) / (track.duration * track.length)
+
+
 def moved_through_water(track: Track) -> jax.Array:
     """`[S - 1, 3, lanes]` the robot's way from row to row, less that of the water around it [m]."""
     assert track.water_velocity is not None
@@ -223,8 +228,7 @@ def directed_swim(track: Track, settings: TaskConfig) -> jax.Array:
     if settings.horizon is not None:
         return _counted(*(_along(v, settings) for v in _foretold(track, settings, moved[:, :2])))
     along = _along(jnp.swapaxes(moved, 0, 1), settings)
-    counted = jnp.sum(_counted(along, along * _keeps_depth(track, settings)), 0)
-    return counted / (track.duration * track.length)
+    return _progress(track, along, along * _keeps_depth(track, settings))
 
 
 def speed(track: Track, settings: TaskConfig) -> jax.Array:
@@ -250,7 +254,7 @@ def _foretold(track: Track, settings: Any, moved: jax.Array) -> tuple[jax.Array,
     Returns:
         `[2, lanes]` each [body lengths/s]: of the whole way, and of that at its depth.
     """
-    half = moved.shape[0] // 2
+    half = max(1, moved.shape[0] // 2)
     first, second = (jnp.sum(x, 0) for x in (moved[:half], moved[-half:]))
     way = (safe_norm(tuple(first)) + safe_norm(tuple(second))) / 2
     ahead = first[0] * second[0] + first[1] * second[1]
@@ -320,8 +324,7 @@ def follow_course(track: Track, settings: TaskConfig) -> jax.Array:
     # At a sudden turn, the mean of the courses before and after counts.
     course = (track.course[1:] + track.course[:-1]) / 2
     along = jnp.sum(moved * course, 1)
-    counted = jnp.sum(_counted(along, along * _keeps_depth(track, settings)), 0)
-    return counted / (track.duration * track.length)
+    return _progress(track, along, along * _keeps_depth(track, settings))
 
 
 def hold_depth(track: Track, settings: TaskConfig) -> jax.Array:
@@ -358,9 +361,7 @@ def crawl(track: Track, settings: TaskConfig) -> jax.Array:
     """Progress along a direction while the core stays near the bed [body lengths/s]."""
     along = _along(jnp.swapaxes(jnp.diff(track.position, axis=0), 0, 1), settings)
     middle = (track.clearance[1:] + track.clearance[:-1]) / 2
-    kept = along * _keeping(middle, settings.depth_tolerance)
-    counted = jnp.sum(_counted(along, kept), 0)
-    return counted / (track.duration * track.length)
+    return _progress(track, along, along * _keeping(middle, settings.depth_tolerance))
 
 
 _SPEED = "body lengths/s"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import product
 from typing import Annotated, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -156,7 +157,10 @@ class NamedGenes:
         # The name of a copy is its original's with a number; so is that of a second parent's module
         # with a name that the first one has, too.
         copied = {k: v for p in parents for k, v in p.items()}
-        found = [known.get(n, copied.get(_COPY.sub("", n))) for n in layout.names]
+        found = [
+            known.get(n, next((copied[x] for x in _originals(n) if x in copied), None))
+            for n in layout.names
+        ]
         have = np.array([value is not None for value in found], bool)
         values = np.array([0.0 if value is None else value for value in found])
         for k in np.flatnonzero(~have):
@@ -184,6 +188,12 @@ class NamedGenes:
     def check(self, brain: object) -> dict[str, float]:
         """Genes by name."""
         return read(_NAMED, brain, "brain")
+
+
+def _originals(name: str) -> list[str]:
+    """Genes of which one may be a copy: with the original's joint, of a pair either or both."""
+    ends = [(end, _COPY.sub("", end)) for end in name.split("~")]
+    return ["~".join(chosen) for chosen in product(*ends)]
 
 
 def _named(layout: GeneLayout, values: Iterable[float]) -> dict[str, float]:

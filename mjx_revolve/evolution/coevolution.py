@@ -165,7 +165,8 @@ class BodyEvolution(IndividualEvolution):
         """Children of selected parents."""
         evolution, living = self.config.evolution, search.living
         count = self.selection.offspring or evolution.population_size
-        rng = np.random.default_rng([evolution.seed, generation])
+        # `count` makes it another stream than each child's: a seed's missing numbers count as 0.
+        rng = np.random.default_rng([evolution.seed, generation, count])
         new = self._novelty(living, search)
         candidates = self._candidates(living, new, len(living))
         pairs = self.scheme.parents(rng, candidates, self.selection, count)

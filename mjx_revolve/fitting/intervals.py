@@ -91,7 +91,10 @@ def estimate(problem: FitProblem, state: FitState, model: Model) -> Estimate:
     """Values and their covariance at the end of a search."""
     count = len(problem.parameters)
     inflation = correlation(problem, model.values)
-    noise = _widened(problem, model.values, state.noise)
+    noise = state.noise
+    if not state.inflated:  # a search that was cut short
+        noise = {kind: sigma * np.sqrt(inflation[kind]) for kind, sigma in noise.items()}
+    noise = _widened(problem, model.values, noise)
     system = normal_equations(problem, model, state.point, noise)
     covariance = np.linalg.inv(with_prior(problem, system))
     rest = system.matrix[count:, count:]
@@ -113,7 +116,7 @@ def estimate(problem: FitProblem, state: FitState, model: Model) -> Estimate:
         (alone + alone.T) / 2,
         state.point.local,
         np.sqrt(np.diag(covariance)[count:]).reshape(state.point.local.shape),
-        {kind: sigma / np.sqrt(inflation[kind]) for kind, sigma in state.noise.items()},
+        {kind: sigma / np.sqrt(inflation[kind]) for kind, sigma in noise.items()},
         inflation,
     )
 

@@ -192,9 +192,7 @@ def rest_height(robot: Robot) -> float:
     carried = world.density * table.volume.sum()
     if robot.morphology.mass > 0.995 * carried:
         return world.surface_height - 1.0
-    reach = np.abs(layout.rotation[:, 2]) @ np.ones(3) * 0 + np.einsum(
-        "pj,pj->p", np.abs(layout.rotation[:, 2]), table.half_size
-    )
+    reach = np.sum(np.abs(layout.rotation[:, 2]) * table.half_size, 1)
     low, high = -1.0, 1.0
     for _ in range(50):
         middle = (low + high) / 2

@@ -377,7 +377,7 @@ def make_problem(
     roots, spread = (np.stack([s[k] for s in starts], -1) for k in range(2))
     count = windows * steps
     commands = tuple(
-        _commands(r, b, dt, count, hinges, jets, prescribed, robot, windows)
+        _commands(r, b, dt, count, hinges, jets, prescribed, windows)
         for r, b in zip(recordings, begin, strict=True)
     )
     ctrl = np.stack([f(0.0) for f in commands], -1)
@@ -445,7 +445,7 @@ def _prescribed(
 
 def _commands(
     recording: RobotRecording, begin: float, dt: float, count: int, hinges: Sequence[str],
-    jets: Sequence[str], prescribed: set[str], robot: Robot, windows: int,
+    jets: Sequence[str], prescribed: set[str], windows: int,
 ) -> Callable[[float], np.ndarray]:  # fmt: skip
     """Commands by how late the recording's clock is [s]: `[K, N, nu]`, the mean over each step."""
     edges = begin + dt * np.arange(count + 1)
@@ -458,7 +458,7 @@ def _commands(
             columns.append(_constant(targets))
         else:
             columns.append(_held(recording, f"command.{name}", edges, dt))
-    columns += [_held(recording, f"command.{name}", edges, dt) for name in jets]
+    columns += [_held(recording, f"command.{name}", edges, dt, True) for name in jets]
 
     def commands(late: float) -> np.ndarray:
         if not columns:
@@ -480,19 +480,20 @@ def _course(signal: Any, at: np.ndarray) -> np.ndarray:
 
 
 def _held(
-    recording: RobotRecording, name: str, edges: np.ndarray, dt: float
+    recording: RobotRecording, name: str, edges: np.ndarray, dt: float, jet: bool = False
 ) -> Callable[[float], np.ndarray]:
-    """A command that holds until the next one; before the first one, 0 or a hinge's first."""
+    """A command that holds until the next one; before the first, 0 or a hinge's first."""
     signal = recording.signals.get(name)
     if signal is None:
         return lambda late: np.zeros(len(edges) - 1)
     time, value = signal
+    before = 0.0 if jet else value[0]
     area = np.concatenate([[0.0], np.cumsum(np.diff(time) * value[:-1])])
 
     def mean(late: float) -> np.ndarray:
         t = edges + late
         inside = np.interp(t, time, area) + value[-1] * np.maximum(t - time[-1], 0)
-        inside += value[0] * np.minimum(t - time[0], 0)
+        inside += before * np.minimum(t - time[0], 0)
         return np.diff(inside) / dt
 
     return mean
@@ -516,12 +517,18 @@ class _View:
         self.quat: np.ndarray | None = quat if "qw" in signals else None
         self.level = False
         if self.quat is None and "yaw" in signals:
-            turns = [np.interp(self.time, *signals[n]) if n in signals else 0 * self.time
-                     for n in ("yaw", "pitch", "roll")]  # fmt: skip
+            turns = [
+                np.interp(self.time, signals[n].time, np.unwrap(signals[n].value))
+                if n in signals
+                else 0 * self.time
+                for n in ("yaw", "pitch", "roll")
+            ]
             self.quat = Rotation.from_euler("ZYX", np.stack(turns, -1)).as_quat(scalar_first=True)
             self.level = "roll" not in signals
         if self.names:
             self._fit_marks()
+        if self.quat is not None and not np.isfinite(self.quat).all(1).any():
+            self.quat = None
         times = [signals[n].time for n in signals if not n.startswith(("command.", "angle."))]
         if "mean_speed" in signals:
             times += [s.time for n, s in signals.items() if n.startswith(("command.", "angle."))]

@@ -242,7 +242,7 @@ def _name_columns(
         column, factor = match["column"], match["factor"]
         if column in header:
             usual = 1.0 if factor else _unit(column)[1]
-            found[name] = header.index(column), float(factor) if factor else usual
+            found[name] = header.index(column), _factor(name, factor) if factor else usual
             continue
         try:
             found[name] = None, float(source)
@@ -274,6 +274,13 @@ def _name_columns(
     return found
 
 
+def _factor(name: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"--map {name}: expected a number after *; found {show(text)}") from None
+
+
 def _unit(column: str) -> tuple[str, float]:
     """A column's name without its unit, and the unit in SI."""
     for end, factor in _UNITS.items():
@@ -302,7 +309,7 @@ def _read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, TimeSeries]:
     for name, source in columns.items():
         match = _SOURCE.match(source)
         assert match is not None
-        named[match["column"]] = name, float(match["factor"] or 1.0)
+        named[match["column"]] = name, _factor(name, match["factor"] or "1")
     try:
         with Reader(path) as bag:
             for connection, stamp, raw in bag.messages():

@@ -66,8 +66,8 @@ class Prediction:
     def error(self, which: np.ndarray, held: bool) -> float:
         """Root mean square distance of `fitted` or `before` from what was recorded [m]."""
         rows = self.held if held else ~self.held
-        square = np.nansum((which - self.recorded)[rows] ** 2, 1)
-        return float(np.sqrt(square.mean())) if rows.any() else float("nan")
+        off = (which - self.recorded)[rows & np.isfinite(self.recorded).any(1)]
+        return float(np.sqrt(np.nansum(off**2, 1).mean())) if len(off) else float("nan")
 
     @property
     def way(self) -> float:

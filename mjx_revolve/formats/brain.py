@@ -24,7 +24,7 @@ from mjx_revolve.engine.plant import Plant, plant_of
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.fitness import Fitness
 from mjx_revolve.formats.brain_program import Builder, Program, kind_of
-from mjx_revolve.formats.links import make_links, plain
+from mjx_revolve.formats.links import make_links, plain, unique_names
 from mjx_revolve.inputs.errors import InputError
 
 READINGS: dict[str, tuple[str, str]] = {
@@ -187,10 +187,12 @@ def _lower(
         state.append(builder.input(f"state{k}", kind_of(x.dtype), x.size))
     time = builder.input("time", "real", 1)
     signals, leaves = [], {}
-    for name, unit, words, parts in _list_readings(readings):
+    listed = list(_list_readings(readings))
+    names = unique_names([row[0] for row in listed], set())
+    for name, (_, unit, words, parts) in zip(names, listed, strict=True):
         sizes = [int(np.prod(part.shape)) for part in parts]
         number = builder.input(name, "real", sum(sizes))
-        signals.append(Signal(name, unit, words, sum(sizes), number))
+        signals.append(Signal(name, unit, _comment(words), sum(sizes), number))
         ends = np.cumsum([0, *sizes])
         for part, low, high in zip(parts, ends[:-1], ends[1:], strict=True):
             leaf = builder.take([number], np.arange(low, high))

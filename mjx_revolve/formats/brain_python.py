@@ -8,7 +8,7 @@ import numpy as np
 
 from mjx_revolve.formats.brain import Brain, describe_brain
 from mjx_revolve.formats.brain_code import TEMPLATES, Code, array_text, is_bracketed
-from mjx_revolve.formats.brain_program import Value, View, kind_of, number_text
+from mjx_revolve.formats.brain_program import Value, View, find_view, kind_of, number_text
 
 # Takes of more runs than this are done by a table of places.
 _MOST_RUNS = 8
@@ -47,8 +47,29 @@ class _PythonCode(Code):
     def assign(self, number: int, value: Value, text: str) -> str:
         if is_bracketed(text) and len(text) < 80:  # else it breaks between its brackets
             text = text[1:-1]
+        if value.size > 1 and value.op != "take" and not self._is_wide(value):
+            text = f"np.broadcast_to({text}, {value.size})"
         self.lines.append(f"v{number} = {text}")
         return f"v{number}"
+
+    def _is_wide(self, value: Value) -> bool:
+        """Whether an operation's expression has all its elements, not one that stands for all."""
+        for number in value.args:
+            arg = self.program.values[number]
+            if arg.size != value.size:
+                continue
+            if number in self._inline:
+                found = self._is_wide(arg)
+            elif number in self._names:
+                found = True
+            elif arg.data is not None:
+                found = not (arg.data == arg.data[0]).all()
+            else:
+                view = find_view(arg.index)
+                found = view is None or len(arg.args) > 1 or view.step != 0
+            if found:
+                return True
+        return False
 
     def store(self, number: int, value: Value) -> str:
         pieces = [self.at(*run[1:]) for run in self.pieces(value)]

@@ -50,6 +50,11 @@ class ImportedRobot:
     files: tuple[dict[str, Any], dict[str, Any]]
     missing: tuple[str, ...]
 
+    def paths(self, folder: str | Path = ".") -> tuple[Path, Path]:
+        """Of the two files that `save` writes."""
+        name = self.morphology.name
+        return Path(folder) / f"{name}.yaml", Path(folder) / f"{name}_modules.yaml"
+
     def save(self, folder: str | Path = ".") -> tuple[Path, Path]:
         """Writes two YAML files named after the robot: morphology and types of modules.
 
@@ -59,8 +64,7 @@ class ImportedRobot:
         Returns:
             The two paths.
         """
-        name = self.morphology.name
-        paths = Path(folder) / f"{name}.yaml", Path(folder) / f"{name}_modules.yaml"
+        paths = self.paths(folder)
         for path, data in zip(paths, self.files, strict=True):
             text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
             write_atomic(path, text.encode())

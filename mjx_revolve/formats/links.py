@@ -135,8 +135,10 @@ def make_links(robot: Robot) -> tuple[Link, ...]:
     """
     model = robot.mj_model
     modules = [model.body(body).name for body in range(1, model.nbody)]
-    names = _unique([BASE] + [f"{plain(name)}_link" for name in modules[1:]], taken={WORLD, ODOM})
-    joints = _unique([plain(name) for name in modules], taken={*names})
+    names = unique_names(
+        [BASE] + [f"{plain(name)}_link" for name in modules[1:]], taken={WORLD, ODOM}
+    )
+    joints = unique_names([plain(name) for name in modules], taken={*names})
     parts = _place_parts(robot, taken={*names, *joints})
     links = []
     for body, (name, joint) in enumerate(zip(names, joints, strict=True), 1):
@@ -263,7 +265,7 @@ def _parts(morphology: Morphology) -> list[tuple[Module, Part]]:
 
 def _place_parts(robot: Robot, taken: set[str]) -> list[PlacedPart]:
     table, parts = robot.fluid, _parts(robot.morphology)
-    names = _unique([plain(f"{m.name}_{p.name}") for m, p in parts], taken)
+    names = unique_names([plain(f"{m.name}_{p.name}") for m, p in parts], taken)
     rows = zip(names, _mesh_names(robot.morphology), parts, strict=True)
     return [
         PlacedPart(
@@ -299,7 +301,7 @@ def _mesh_names(morphology: Morphology) -> list[str]:
     return names
 
 
-def _unique(names: list[str], taken: set[str]) -> list[str]:
+def unique_names(names: list[str], taken: set[str]) -> list[str]:
     """The names, those that are taken with a number at the end."""
     taken, found = {*taken}, []
     for name in names:

@@ -366,6 +366,7 @@ def _urdf_hinge(joint: Element, missing: list[str]) -> _Hinge | None:
 # ------------------------------------------------------------------------------------------- MJCF
 
 _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
+_MOVES_JOINTS = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _KINDS = {
     _GEOM.mjGEOM_BOX: "box", _GEOM.mjGEOM_SPHERE: "sphere", _GEOM.mjGEOM_ELLIPSOID: "ellipsoid",
     _GEOM.mjGEOM_CYLINDER: "cylinder", _GEOM.mjGEOM_CAPSULE: "capsule",
@@ -395,6 +396,13 @@ def _read_mjcf(root: Element, path: Path) -> RigidRobot:
             continue
         there = model.body_pos[body], quat_to_matrix(model.body_quat[body])
         hinge, joint = _mjcf_hinge(model, body, missing) if body != top else (None, "")
+        if (
+            body == top
+            and model.body_jntnum[top]
+            and model.jnt_type[model.body_jntadr[top]] != _JOINT.mjJNT_FREE
+        ):
+            first = model.joint(int(model.body_jntadr[top])).name or robot.name
+            missing.append(f"{first}: the joint of the first body, which is free here")
         own = joint or model.body(body).name or robot.name
         numbers[body], places[body] = robot._add(
             numbers[parent], _then(places[parent], there), own, hinge
@@ -434,7 +442,8 @@ def _mjcf_hinge(model: mujoco.MjModel, body: int, missing: list[str]) -> tuple[_
         limits["range"] = (model.jnt_range[j] - model.qpos0[model.jnt_qposadr[j]]).tolist()
     efforts = [model.jnt_actfrcrange[j][1]] if model.jnt_actfrclimited[j] else []
     for k in range(model.nu):
-        if model.actuator_trnid[k, 0] == j and model.actuator_forcelimited[k]:
+        moves = model.actuator_trntype[k] in _MOVES_JOINTS and model.actuator_trnid[k, 0] == j
+        if moves and model.actuator_forcelimited[k]:
             efforts.append(model.actuator_forcerange[k][1] * abs(model.actuator_gear[k, 0]))
     if efforts and min(efforts) > 0:
         limits["effort"] = min(efforts)

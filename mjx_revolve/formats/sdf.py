@@ -30,6 +30,7 @@ from mjx_revolve.formats.links import (
     plain,
     rest_pose,
     roll_pitch_yaw,
+    unique_names,
     words_on_laws,
 )
 from mjx_revolve.formats.xml_text import Value, node, nodes, to_document, to_list
@@ -172,7 +173,7 @@ def _surroundings(robot: Robot) -> Iterator[Element]:
                 node("visual", seen, _material(SAND), name="visual"),
                 name="bed",
             ),
-            name="bed",
+            name=unique_names(["bed"], {plain(robot.morphology.name)})[0],
         )
 
 

@@ -13,6 +13,7 @@ from matplotlib.ticker import MaxNLocator
 
 from mjx_revolve.view.motion import (
     Motion,
+    count_finite,
     last_strokes,
     last_swings,
     mean_rate,
@@ -54,7 +55,9 @@ _SWINGS = 12.0  # of a thruster's command that one picture shows
 
 def plot_trajectory(trajectory: Trajectory, surface_height: float = 0.0, title: str = "") -> Figure:
     """Draws the core's path of a trajectory, see `plot_path`."""
+    count = max(count_finite(trajectory.qpos), 2)  # up to where it blows up
     time, path = np.asarray(trajectory.time, float), np.asarray(trajectory.xpos, float)[:, 1]
+    time, path = time[:count], np.nan_to_num(path[:count])
     return plot_path(time, path, surface_height, title)
 
 

@@ -199,25 +199,6 @@ def displaced_water(
     return mul(whole, share), vscale(whole, vadd(moment, vscale(share, center)))
 
 
-def buoyancy(
-    up: Vec, share: Scalar, moment: Vec, volume: Scalar, center: Vec, weight_density: Scalar
-) -> tuple[Vec, Vec]:
-    """Archimedes' force on a part, and its torque about the box's centre.
-
-    Args:
-        up: the world's vertical, part frame; times gravity plus the water's own acceleration when
-            the last argument is the density [kg/m³] alone.
-        share, moment, volume: as in `displaced_water`.
-        center: centre of volume, from the box's centre, part frame [m].
-        weight_density: ρ g of the water [N/m³].
-
-    Returns:
-        Force [N] and torque [N·m], part frame, at the box's centre.
-    """
-    weight, first = displaced_water(share, moment, volume, center, weight_density)
-    return vscale(weight, up), cross(first, up)
-
-
 def surface_tension(
     up: Vec,
     depth: Scalar,

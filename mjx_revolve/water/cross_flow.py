@@ -169,6 +169,7 @@ def _numbers(parts: PartShapes, world: World) -> CrossFlowNumbers:
     # Faces across y and z are side faces of a chain along x: their areas, on two sides each.
     wet = 2 * ((1 - along) * exposed * parts.silhouette).sum(-1)
     rubbing = 0.5 * parts.coefficients["friction"] * share[:, 0] * wet
+    rubbing = rubbing if world.density > 0 else 0 * rubbing
     viscous = world.viscosity > 0
     return CrossFlowNumbers(
         head=head,
@@ -196,7 +197,9 @@ def friction_times_reynolds(reynolds: Scalar) -> Scalar:
 
 def friction_share(speed: Scalar, length: Scalar, world: World) -> Scalar:
     """C_f / a of side faces of some length [m]: 1 / (log10 Re)^b."""
-    scale = mul(length, world.density / max(world.viscosity, 1e-30))
+    if world.viscosity == 0:
+        return 0.0
+    scale = mul(length, world.density / world.viscosity)
     reynolds = jnp.maximum(mul(speed, scale), _LEAST_REYNOLDS)
     share: Scalar = friction_times_reynolds(reynolds) / reynolds
     return share

@@ -254,12 +254,16 @@ def lift_drag_damping(
     """
     density = density if p.density is None else p.density
     speed = safe_norm(v)
+    return mul(mul(density, area), _gradient(p, speed.dtype).astype(speed.dtype) * speed)
+
+
+def _gradient(p: LiftDrag | PlateNumbers, dtype: Any) -> Any:
+    """Largest lift slope and largest drag slope together, of forces over ρ A |v| [-]."""
     xp = jnp if isinstance(p.cla, jax.Array) else np
-    k = {name: xp.abs(x) for name, x in slopes(p, speed.dtype).items()}
+    k = {name: xp.abs(x) for name, x in slopes(p, dtype).items()}
     steepest = xp.maximum(k["cla"], k["cla_stall"])
     most = k["cda"] * k["alpha_stall"] + k["cda_stall"] * (np.pi / 2 - k["alpha_stall"])
-    gradient = steepest + xp.maximum(xp.maximum(k["cda"], k["cda_stall"]), 2 * most)
-    return mul(mul(density, area), gradient.astype(speed.dtype) * speed)
+    return steepest + xp.maximum(xp.maximum(k["cda"], k["cda_stall"]), 2 * most)
 
 
 def _plates_of(parts: PartShapes, world: World) -> PlateNumbers:
@@ -284,7 +288,8 @@ LIFT_DRAG = PartDragLaw(
     summary="Gazebo's lift and drag of a plate",
     explicit=False,
     varied=True,
-    steepest=10.0,  # lift: 2π, and drag
+    # 10: lift of 2π, and drag.
+    steepest=lambda plate: np.maximum(10.0, _gradient(plate, float)) * plate.area,
     parameters=LiftDrag,
     numbers=_plates_of,
     force=_plate_drag,

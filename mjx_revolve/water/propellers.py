@@ -101,6 +101,11 @@ class Thruster:
         backward = self.gain if self.gain_backward is None else self.gain_backward
         return backward * min(square - low, 0.0) + self.gain * max(square - high, 0.0)
 
+    @property
+    def largest_thrust(self) -> float:
+        """The size of its thrust at the ends of its range [N]."""
+        return max(abs(self.thrust_at(command)) for command in self.range)
+
     def scaled(self, factor: float) -> Thruster:
         """The same with thrust multiplied by a factor at every command.
 

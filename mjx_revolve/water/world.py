@@ -129,7 +129,8 @@ class World:
     Attributes:
         name: what it is called.
         density: of the water [kg/m³]. 999.1026 at 15 °C is the thesis's value.
-        viscosity: dynamic, of the water [Pa·s]; only MuJoCo's two laws use it. 1.138e-3 at 15 °C.
+        viscosity: dynamic, of the water [Pa·s]; of MuJoCo's two laws, and of friction along
+            chains, plates and fins. 1.138e-3 at 15 °C.
         gravity: downwards [m/s²].
         surface_height: z of the water surface, world frame [m].
         current: velocity of the water, world frame [m/s], length 3.
@@ -243,8 +244,11 @@ def load_world(name: str | Path, **overrides: Any) -> World:
     for key, value in overrides.items():
         # A mapping changes what it names and keeps the rest: a bed's friction, not its whole shape.
         below = fields.get(key)
+        if key == "bed" and isinstance(below, int | float):
+            below = {"height": below}
         if isinstance(below, Mapping) and isinstance(value, Mapping):
-            alike = value.get("kind", below.get("kind")) == below.get("kind")
+            kind = below.get("kind", "flat")
+            alike = value.get("kind", kind) == kind
             overrides[key] = {**below, **value} if alike else value
     with reading(f"world {world.name}"):
         world = read(World, fields | {"current_field": world.current_field} | overrides)

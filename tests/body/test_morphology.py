@@ -13,6 +13,7 @@ import yaml
 
 from laboratory import ROOT
 from mjx_revolve.body.catalogue import MODULES, THESIS_MODULES, LiftDrag
+from mjx_revolve.body.coefficients import read_morphology_files
 from mjx_revolve.body.exposure import exposure
 from mjx_revolve.body.morphology import (
     MAX_MODULES,
@@ -228,6 +229,24 @@ body:
     assert (frame.electronics_volume, servo.electronics_volume) == (0.0, 1e-6)
     assert brick.kind.mass == 0.0
     assert MODULES["Core"].mass == 0.09
+
+
+def test_fitted_coefficients_count_once_and_come_back_from_a_file(tmp_path):
+    entries = "modules: {all: {ballast: 0.01}, Core: {ballast: 0.02, factors: {mass: 1.2}}}"
+    (tmp_path / "fits").mkdir()
+    (tmp_path / "fits" / "fit.yaml").write_text(entries)
+    text = "coefficients: %s\nbody: {type: CoreComponent, id: %s, params: {ballast: 0.05}}"
+    (tmp_path / "robots").mkdir()
+    for name in ("Core", "c"):
+        path = tmp_path / "robots" / f"{name}.yaml"
+        path.write_text(text % ("../fits/fit.yaml", name))
+        robot = load_morphology(path)
+        assert robot.mass == pytest.approx((0.09 + 0.05 + 0.01 + 0.02) * 1.2)
+        assert make_morphology(robot.to_mapping()).mass == pytest.approx(robot.mass)
+        for place, content in read_morphology_files(path).items():
+            assert ".." not in place
+            (tmp_path / place).write_bytes(content)
+        assert load_morphology(tmp_path / path.name).mass == robot.mass
 
 
 def test_ballast_without_a_place_is_spread_and_with_one_is_a_point(tmp_path):

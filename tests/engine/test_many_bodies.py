@@ -19,7 +19,7 @@ from mjx_revolve.body.edits import add_module
 from mjx_revolve.control.controller import gene_indices
 from mjx_revolve.engine.batch import PartGroup, fit_capacity, order_rows, pack_bodies
 from mjx_revolve.engine.batched_trees import make_batched_trees
-from mjx_revolve.engine.population import acceleration
+from mjx_revolve.engine.population import PopulationEngine, acceleration
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.step_constants import read_constants
 from mjx_revolve.episodes.config import make_config
@@ -158,6 +158,30 @@ def test_more_padding_and_more_overflow_rows_change_nothing():
     assert np.sum(order.overflow & (order.body == 1)) > 0
     again = mixed_acceleration(robots, single, 4, arrays)
     assert np.all(np.abs(again - found).max(0) < 1e-9 * scale)
+
+
+@pytest.mark.slow
+def test_a_body_in_several_rows_steps_as_in_one():
+    """How much of its drag a step takes implicitly follows from the whole body."""
+    robot = zoo("default")[0]
+    arrays, _ = states([robot], roomy := fit_capacity([robot]), 1, 0.0)
+
+    def march(capacity):
+        def run(bodies, q, v, c):
+            trees = make_batched_trees(robot.world, capacity, bodies, 1)
+            engine, ctrl = PopulationEngine(trees, bodies.plant), bodies.plant.arrange(c)
+            step = lambda k, state: engine.step(state, ctrl, water_of(robot.world))[0]  # noqa: E731
+            return engine.observe(jax.lax.fori_loop(0, 10, step, engine.init(q, v)))[0]
+
+        with jax.enable_x64(True):
+            run = jax.jit(run, compiler_options=QUICK)
+            return np.asarray(run(pack([robot], capacity, 1), *map(jnp.asarray, arrays)))
+
+    groups = tuple(g._replace(parts=1, root_parts=1) for g in roomy.groups)
+    narrow = resize_capacity(roomy, rows=40, slots=5, groups=groups)
+    found = march(narrow)
+    np.testing.assert_allclose(found, march(roomy), atol=1e-12)
+    assert np.abs(found - arrays[0]).max() > 1e-3
 
 
 def test_a_short_stack_holds_any_tree():

@@ -233,12 +233,25 @@ def test_an_edited_model_is_a_new_robot(kind):
     assert make_engine(other, "mjx").robot.mj_model.dof_damping[9] == 0.5
 
 
+def test_modules_that_meet_in_an_edited_range_are_found():
+    robot = build_robot(body("spider"), world())
+    edit = copy.copy(robot.mj_model)
+    edit.jnt_range[1:] = [-2.6, 2.6]
+    wide = robot.with_model(edit).assembly
+    assert len(robot.assembly.meeting_pairs) == 0 < len(wide.meeting_pairs)
+    assert wide.stops[2:].max() < 1.8 < wide.range[2:].max()
+
+
 def test_what_an_edited_model_may_not_change():
     robot = build_robot(body("snake"), world())
     edit = copy.copy(robot.mj_model)
     edit.body_pos[3] += 0.1
     edit.opt.timestep = 0.1
     with pytest.raises(InputError, match=r"servos only; found another body_pos, opt\.timestep"):
+        robot.with_model(edit)
+    edit = copy.copy(robot.mj_model)
+    edit.jnt_stiffness[2] = 1.0
+    with pytest.raises(InputError, match="servos only; found another jnt_stiffness"):
         robot.with_model(edit)
     spec = robot.mj_spec
     spec.geoms[0].size = [-1.0, 0.0, 0.0]

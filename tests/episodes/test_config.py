@@ -69,6 +69,13 @@ def test_defaults(folder):
          "numbers [m], or target_distance, as there is a target_turn; found none"),
 ("task={type: follow_course, course_spread: 1, direction: [0, 0, 1]}", "task.direction: "
          "expected one that is not upright, as there is a course_spread, which is level; found"),
+("task.target_speed=0.1", "task.target_speed: expected 0, as there is no target or target_dist"),
+("task.course_turn=1", "task.course_turn: expected 3.14159, as there is no course_changes; fou"),
+("task={type: hold_heading, direction: [0, 0, 1]}", "task.direction: expected one that is not "
+         "upright, as there is task.type hold_heading, which is level"),
+("controller={type: feedback, amplitude: 0.5}", "controller.amplitude: expected 1, as only types"),
+("controller={type: sine, harmonics: 8}", "controller.max_frequency: expected at most half of "
+         "controller.rate (20 Hz), to be sampled by it, of the last of 8 harmonics; found 2"),
 ("controller.harmonics=3", "--set controller.harmonics: expected 1, as only type sine has "
          "it (--set controller.harmonics=1); found 3"),
 ("controller.sensors=[gyro]", "--set controller.sensors: expected null, as only types mlp, "

@@ -59,6 +59,23 @@ def test_what_only_drifts_fails_without_its_brain_alone(tmp_path, short):
     np.testing.assert_allclose(*(scores[1.2] for scores in both), rtol=1e-5)
 
 
+def test_courses_and_gusts_are_the_same_for_all_times_and_steps():
+    task = TASK | {"type": "follow_course", "course_spread": 1.0, "course_changes": 2}
+    own = {"name": "lake", "gust": {"std": 0.1, "time": 1.0}}
+    make = [
+        make_fitness({"morphology": "auv", "world": own | {"timestep": dt}, "task": task | more})
+        for dt, more in ((0.01, {}), (0.01, {"duration": 6.0}), (0.005, {}))
+    ]
+    own = make[0], make[0].world, jax.random.key(1)
+    starts = [passport.fresh_starts(x, *own) for x in make]
+    assert np.max(starts[0].course.moments) < 0.6
+    for other in starts[1:]:
+        jax.tree.map(np.testing.assert_array_equal, other.course, starts[0].course)
+    np.testing.assert_array_equal(starts[1].gusts[:61], starts[0].gusts)
+    np.testing.assert_allclose(starts[2].gusts[::2], starts[0].gusts, atol=1e-7)
+    assert starts[2].gusts.shape[0] == 121
+
+
 @pytest.mark.parametrize(
     ("wave", "expected"),
     [

@@ -112,6 +112,19 @@ def test_spaces_and_what_comes_out_are_as_gymnasium_has_them(env, episode):
         env.step(np.zeros(5))
 
 
+def test_a_target_that_drifts_stands_in_the_score_so_far(config):
+    """A robot at rest loses what the target gains on it, step by step, and nothing beforehand."""
+    more = {"task.type": "reach_target", "task.target_distance": 1.0, "task.target_speed": 0.1}
+    fitness, key = make_fitness(config, **more), jax.random.key(2)
+    context = jax.tree.map(lambda x: jnp.asarray(x)[None], fitness.context(key))
+    start, rows = jnp.asarray(fitness.starts(key)[0][:3, :1]), fitness.num_records
+    track = {"position": jnp.tile(start, (rows, 1, 1)), "energy": jnp.zeros((rows, 1))}
+    clocks = fitness.record_every * jnp.arange(rows + 1)
+    scores = [fitness.score_so_far(track, start, fitness.geometry, context, k)[0] for k in clocks]
+    way = 0.1 * fitness.record_every * fitness.world.timestep / fitness.geometry.stretched
+    assert np.abs(np.diff(scores, axis=0)).max() <= 1.01 * way and abs(scores[-1]) > way
+
+
 @pytest.mark.slow
 def test_rewards_add_up_to_the_tasks_score(env, fitness, episode):
     _, rewards, died, over, infos = episode

@@ -113,18 +113,20 @@ def test_of_two_parents_the_first_ones_joints_come_first():
 
 
 def test_a_copy_does_as_its_original():
-    brains = make_brain_encoding(BrainsConfig(mutation=0.0), common())
-    bare = add_module(body("core"), 0, 0, "ActiveHinge", name="fin")
-    bare = add_module(bare, 0, 1, "ActiveHinge", name="leg")
-    double = add_module(bare, 0, 2, "ActiveHinge", name="fin_2")
-    layout = layout_of(double, common=common())
-    parent = {name: 1.0 + k for k, name in enumerate(layout_of(bare, common=common()).names)}
+    brains = make_brain_encoding(BrainsConfig(mutation=0.0), common(make_cpg))
+    bare = body("core")
+    for k, name in enumerate(("fin", "knee", "toe")):
+        double = bare = add_module(bare, k, min(k, 1), "ActiveHinge", name=name)
+    for k, name in ((0, "fin_2"), (4, "knee_2"), (5, "toe_2")):
+        double = add_module(double, k, 1 if k else 2, "ActiveHinge", name=name)
+    before, layout = (layout_of(x, make_cpg, common(make_cpg)) for x in (bare, double))
+    parent = {name: 1.0 + k for k, name in enumerate(before.names)}
     child = brains.inherit(np.random.default_rng(0), [parent], layout)
-    for what in ("u", "v", "offset"):
-        assert child[f"{what} fin_2"] == child[f"{what} fin"] == parent[f"{what} fin"]
+    for old, new in (("w fin", "w fin_2"), ("c knee~toe", "c knee_2~toe_2")):
+        assert child[new] == child[old] == parent[old]
     other = dict.fromkeys(parent, -1.0)
     child = brains.inherit(np.random.default_rng(0), [parent, other], layout)
-    assert child["u fin_2"] == -1 and child["u fin"] == parent["u fin"]
+    assert child["w fin_2"] == -1 and child["w fin"] == parent["w fin"]
 
 
 def test_the_network_by_hand():

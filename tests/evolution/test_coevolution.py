@@ -213,6 +213,15 @@ def test_generations(folder, selection):
         )
 
 
+def test_parents_and_children_have_random_streams_of_their_own(folder, monkeypatch):
+    evolution = BodyEvolution(*start(folder, {"selection": {"type": "steady", "offspring": 1}}))
+    search, _ = run(*start(folder), None)
+    seeds, make = [], np.random.default_rng
+    monkeypatch.setattr(np.random, "default_rng", lambda s: seeds.append(s) or make(s))
+    evolution._children(search, 7)
+    assert len({make(seed).random() for seed in seeds}) == len(seeds) >= 2
+
+
 @pytest.mark.parametrize("kind", ["plus", "generational"])
 def test_scores_of_reevaluated_parents_are_means_over_their_generations(folder, kind):
     config, executor = start(folder, {"selection": {"type": kind, "reevaluate": True}})

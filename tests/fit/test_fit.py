@@ -21,6 +21,7 @@ from mjx_revolve.episodes.simulate import simulate
 from mjx_revolve.evolution.interrupts import Interrupts
 from mjx_revolve.fitting import (
     FitSettings,
+    Prediction,
     RobotRecording,
     TimeSeries,
     fit_robot,
@@ -340,6 +341,14 @@ def test_marks_that_are_not_on_the_robot_are_refused(auv, tmp_path, columns, wor
         make_problem(auv, [recording], ["drag"], FitSettings())
 
 
+def test_errors_are_of_what_was_recorded():
+    found, none = np.full((3, 3), np.nan), np.zeros(3, bool)
+    found[1] = 0.2, 0.0, 0.0
+    fit = Prediction("swim", np.arange(3.0), none, found, found + 0.1, found)
+    assert fit.error(fit.fitted, False) == pytest.approx(0.1 * np.sqrt(3))
+    assert fit.error(fit.before, False) == 0 and np.isnan(fit.error(fit.fitted, True))
+
+
 def test_units_gaps_and_factors_of_columns(auv, tmp_path):
     columns = swim()
     columns = {"frame": 20 * columns["time"], "px": 500 * columns["x"], "y_mm": 1e3 * columns["y"],
@@ -347,6 +356,8 @@ def test_units_gaps_and_factors_of_columns(auv, tmp_path):
     kept = np.r_[0:20, 30:60]
     columns["prot"] = columns["z"]  # meant to be that of a thruster, perhaps
     write_csv(tmp_path / "swim.csv", {k: v[kept] for k, v in columns.items()})
+    with pytest.raises(InputError, match=r"--map x: expected a number after \*; found '1e'"):
+        load_recording(tmp_path / "swim.csv", auv, read_map(["time=frame*0.05", "x=px*1e"]))
     given = read_map(["time=frame*0.05", "x=px*0.002"])
     found = load_recording(tmp_path / "swim.csv", auv, given)
     for name in ("x", "y", "yaw"):
@@ -403,6 +414,12 @@ class Stop(Interrupts):
     @signal.setter
     def signal(self, value):
         pass
+
+
+def test_what_a_fit_goes_on_with_is_its_folder_alone(capsys):
+    for more in (["--set", "iterations=9"], ["--plan"], ["--free", "drag"], ["--seed", "3"]):
+        assert run_command(command.main, ["--resume", "fit", *more]) == 2
+        assert f"as the folder has all else; found {more[0][2:]}" in capsys.readouterr().err
 
 
 def test_a_fit_that_was_stopped_goes_on_bit_for_bit(signals, tmp_path):

@@ -28,6 +28,7 @@ from mjx_revolve.formats.brain import _list_readings, champion_brain, make_brain
 from mjx_revolve.formats.brain_c import make_brain_c
 from mjx_revolve.formats.brain_python import make_brain_python
 from mjx_revolve.formats.brain_ros import make_brain_node
+from mjx_revolve.formats.links import unique_names
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.sensor_log import trace_sensors
 from mjx_revolve.water.flow import water_of
@@ -42,7 +43,8 @@ FELT = [
     "bearing", "distance", "course", "battery", "angle", "speed", "load", "contact",
     "nearest_distance", "nearest_tag", {"type": "touch", "at": "feeler"},
     {"type": "accelerometer", "at": "hand"}, {"type": "angle", "at": "arm 1"},
-    {"type": "tilt", "each": "Fin"}, {"type": "depth", "each": "FixedBrick"},
+    {"type": "angle", "at": "arm-1"}, {"type": "tilt", "each": "Fin"},
+    {"type": "depth", "each": "FixedBrick"},
 ]  # fmt: skip
 NETWORK = """
 brain:
@@ -151,8 +153,10 @@ def due(fitness):
 
 def as_given(brain, readings):
     """Readings as files take them."""
-    found = {name: np.concatenate([np.ravel(x) for x in parts])
-             for name, _, _, parts in _list_readings(readings)}  # fmt: skip
+    rows = list(_list_readings(readings))
+    names = unique_names([row[0] for row in rows], set())
+    found = {name: np.concatenate([np.ravel(x) for x in row[3]])
+             for name, row in zip(names, rows, strict=True)}  # fmt: skip
     return {signal.name: found[signal.name] for signal in brain.signals}
 
 
@@ -346,6 +350,18 @@ def test_whole_numbers_and_truth_values(tmp_path, spider):
     found = run_python(make_brain_python(brain), brain, rows)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(run_c(tmp_path, brain, rows), expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["sine", "feedback", "splines", "mlp"])
+def test_joints_that_all_do_the_same_have_a_command_each(kind, tmp_path, spider):
+    """Genes of 0: numbers that are all alike are written once."""
+    controller = CONTROLLERS[kind].make(plant_of(spider).at_rate(20.0))
+    brain = make_brain(spider, controller, np.zeros(controller.num_genes), 20.0)
+    given = [{s.name: np.zeros(s.size) for s in brain.signals}] * 3
+    found = run_python(make_brain_python(brain), brain, given)
+    assert found.shape == (3, 8)
+    if shutil.which("cc"):
+        np.testing.assert_allclose(run_c(tmp_path, brain, given), found, atol=1e-6)
 
 
 def test_names_and_limits_are_those_of_the_robot():

@@ -227,6 +227,9 @@ def test_the_command_writes_what_other_commands_read(tmp_path, capsys, monkeypat
     robot = load_morphology("robots/two_legs.yaml", modules)
     assert robot.num_hinges == 2 and robot.mass == pytest.approx(0.65)
     assert robot == import_robot(path).morphology
+    assert main([str(path)]) == 0
+    with pytest.raises(InputError, match=r"two_legs\.yaml: expected no such file yet"):
+        main([str(path)])
 
 
 @pytest.mark.parametrize(

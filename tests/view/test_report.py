@@ -149,6 +149,17 @@ def test_of_runs_that_are_not_finished_the_furthest_counts(lab, tmp_path):
     assert group.best().seed == 0  # the furthest, where nothing was judged
 
 
+def test_seeds_with_the_same_files_are_one_group(lab, tmp_path):
+    (tmp_path / "fit.yaml").write_text("modules: {all: {factors: {drag: 1.1}}}")
+    overrides = [f"coefficients={tmp_path}/fit.yaml"]
+    for seed in range(2):
+        config = make_config(lab["config"].model_dump(), "/", overrides, "swim.yaml")
+        overrides.append("evolution.passport=false")
+        make_run(tmp_path / f"{seed}", config, lab["fitness"], seed, 6)
+    (group,) = group_runs([read_run(tmp_path / f"{seed}") for seed in range(2)])
+    assert len(group.records) == 2
+
+
 def test_the_best_run_is_the_best_judged_one(lab, tmp_path):
     for seed, (score, finished) in enumerate(((0.2, True), (0.3, True), (0.9, False))):
         make_run(tmp_path / f"{seed}", lab["config"], lab["fitness"], seed, 6, finished, score)

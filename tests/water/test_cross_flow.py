@@ -20,7 +20,7 @@ WATER = world(drag="cross_flow")
 SIZE = np.array([0.2, 0.1, 0.06])  # [m]
 
 
-def chain_numbers(end=0.0):
+def chain_numbers(end=0.0, water=WATER):
     """Of a part in a slender row along x, with neighbours at both ends or at all but one."""
     parts = SimpleNamespace(
         half_size=SIZE[None] / 2,
@@ -31,7 +31,7 @@ def chain_numbers(end=0.0):
         rows=np.array([[2.0, 0.1, 0.06]]),
         coefficients={"drag_coefficient": np.full((1, 3), 1.05), "friction": np.array([0.455])},
     )
-    numbers = CROSS_FLOW.numbers(parts, WATER)
+    numbers = CROSS_FLOW.numbers(parts, water)
     return as_components(jax.tree.map(lambda x: x[0], numbers))
 
 
@@ -108,6 +108,11 @@ def test_along_it_there_is_friction_only(inside):
     wet = 2 * SIZE[0] * (SIZE[1] + SIZE[2])
     expected = -0.5 * WATER.density * friction * wet * speed**2
     assert drag_at(inside, [speed, 0, 0]).force == pytest.approx([expected, 0, 0], rel=4e-3)
+
+
+@pytest.mark.parametrize("none", ["density", "viscosity"])
+def test_without_water_or_its_viscosity_there_is_no_friction(none):
+    assert chain_numbers(water=world(drag="cross_flow", **{none: 0.0})).friction == 0
 
 
 def test_a_spinning_rod_is_dragged_by_its_strips(inside):

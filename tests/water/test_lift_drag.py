@@ -9,7 +9,14 @@ import pytest
 
 from laboratory import accelerate, at_rest, box_robot, face_drag, march, world
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.water.lift_drag import LiftDrag, lift_drag, lift_drag_damping, lift_drag_wrench
+from mjx_revolve.water.lift_drag import (
+    LIFT_DRAG,
+    LiftDrag,
+    lift_drag,
+    lift_drag_damping,
+    lift_drag_wrench,
+    plate_numbers,
+)
 
 RHO, AREA = 999.1026, 0.02
 X, Y, Z = np.eye(3)
@@ -153,6 +160,14 @@ def jacobian(v, p):
 
     with jax.enable_x64(True):
         return np.asarray(jax.jit(jax.vmap(jax.jacobian(force)))(jnp.asarray(v.T)))
+
+
+def test_the_bound_of_the_step_is_that_of_the_plate_not_of_its_box():
+    plate = LiftDrag(area=0.03, cla=9.0, cda=3.0)
+    half, none = np.full((1, 3), 0.01), np.zeros((1, 3))
+    numbers = plate_numbers([plate], half, 4 * half**2, none, RHO)
+    damping = lift_drag_damping((jnp.ones(1), 0.0, 0.0), tuple(X), tuple(Z), 0.03, RHO, plate)
+    assert RHO * LIFT_DRAG.steepest(numbers) == pytest.approx(np.asarray(damping))
 
 
 @pytest.mark.parametrize("plate", ["default", "stalling", "cambered", "turning"])

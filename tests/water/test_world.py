@@ -129,6 +129,13 @@ def test_overrides(override, field, expected):
     assert all(getattr(water, name) == getattr(load_world("lake"), name) for name in rest)
 
 
+def test_a_bed_by_its_height_alone_keeps_it(tmp_path):
+    for given in ("-2.0", "{height: -2, friction: 0.6}"):
+        (tmp_path / "pool.yaml").write_text(f"bed: {given}")
+        pool = load_world(tmp_path / "pool.yaml", bed={"kind": "flat", "friction": 0.3})
+        assert pool.bed == Bed(kind="flat", height=-2.0, friction=0.3)
+
+
 WRONG = [
     ({"density": math.nan}, "density: expected a number >= 0 [kg/m3]; found nan"),
     ({"densty": 1000}, f"densty: expected one of {count(World)} keys; {UNKNOWN} density?"),

@@ -9,12 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from mjx_revolve.evolution.fingerprints import hash_text
-from mjx_revolve.inputs.user_code import content_name, parse_user_function
+from mjx_revolve.episodes.config import Config
+from mjx_revolve.episodes.settings import NamedFile, map_files
+from mjx_revolve.evolution.fingerprints import FREE_SETTINGS
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.report.record import RunRecord, number
 
 # Settings that do not make it another configuration: they only say how it is kept.
-_KEEPING = ("checkpoint_every", "keep_checkpoints", "tensorboard")
+_KEEPING = tuple(name for name in FREE_SETTINGS if name != "generations")
 # Settings that name groups, if they differ, in this order; then all others.
 _DISTINGUISHING = (
     "morphology", "task.type", "world.name", "controller.type", "evolution.strategy",
@@ -100,20 +102,17 @@ def _settings(record: RunRecord) -> dict[str, object]:
     data = dict(record.settings if record.config is None else record.config.model_dump())
     if isinstance(data.get("world"), str):
         data["world"] = {"name": data["world"]}
-    flat = _flatten(data)
+
+    def by_content(file: NamedFile) -> str:
+        try:
+            digest = file._replace(path=str(record.folder / file.path)).digest()[:6]
+        except InputError:
+            digest = ""
+        return f"{file.function or Path(file.path).stem} {digest}"
+
+    flat = _flatten(map_files(data, by_content, Config))
     for key in ("seed", *_KEEPING):
         flat.pop(f"evolution.{key}", None)
-    for key in ("morphology", "modules", "world.name"):
-        value = flat.get(key)
-        if isinstance(value, str) and value.endswith((".yaml", ".yml")):
-            path = record.folder / value
-            text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
-            flat[key] = f"{Path(value).stem} {hash_text(text)[:6]}"
-    for key in ("task.type", "controller.type"):
-        value = flat.get(key)
-        if isinstance(value, str) and parse_user_function(value):
-            function, _, digest = content_name(value).partition(" ")
-            flat[key] = f"{function} {digest[:6]}"
     return flat
 
 

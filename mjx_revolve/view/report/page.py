@@ -205,7 +205,7 @@ def _replay(
     replays: dict[Path, ChampionReplay] = {}
     robots: list[tuple[str, Morphology]] = []
     for group in groups:
-        fitness = None
+        fitness, bodies = None, {}
         for record in (*group.records, *group.copies):
             if record.config is None:
                 continue
@@ -214,6 +214,7 @@ def _replay(
                     fitness = fit_body(record.config, _champions_body(record, record.config))
                 # Runs of a group differ in their seed only, and a fitness does not depend on it.
                 fitness = make_fitness(record.config) if fitness is None else fitness
+                bodies[record.folder] = fitness.robot.morphology
                 known = record.info.get("model_hash")
                 alike = record.population is not None or not isinstance(known, str)
                 if not alike and known != model_hash(fitness):
@@ -225,8 +226,9 @@ def _replay(
                 record.note("untrusted", f"no replay: {error}")
             except InputError as error:
                 record.note("damaged", f"no replay: {error}")
-        if fitness is not None:
-            robots.append((group.name, fitness.robot.morphology))
+        best = group.best()
+        if best is not None and best.folder in bodies:
+            robots.append((group.name, bodies[best.folder]))
     return replays, robots
 
 
@@ -284,7 +286,7 @@ def _convergence(groups: Sequence[RunGroup]) -> str:
     comparisons = []
     for task in dict.fromkeys(group.task for group in shown):
         members = [group for group in groups if group.task == task]
-        if sum(bool(group.shown) for group in members) > 1 or len(members[0].shown) > 1:
+        if sum(len(group.shown) for group in members) > 1:
             comparisons.append(svg_source(convergence.plot_comparison(members, styles)))
     entries = []
     for group in (group for group in shown if len(group.shown) == 1):
