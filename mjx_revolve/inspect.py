@@ -72,7 +72,8 @@ def main(argv: list[str] | None = None) -> int:
         if table:
             print("\n".join(map(plain, table)), end="\n\n")
     print("\n".join(summary(morphology, arguments.density, arguments.gravity)))
-    if (passport := Path(arguments.file).parent / "passport.yaml").is_file():
+    passport = Path(arguments.file).parent / "passport.yaml"
+    if Path(arguments.file).is_file() and passport.is_file():
         from mjx_revolve.episodes.passport import load_passport
 
         print(f"\nchampion of a run: {load_passport(passport).mark or 'passes its passport'}")

@@ -126,6 +126,12 @@ class ArchiveConfig(Settings):
             raise ConstraintError(
                 "axes", "at least two descriptors or measures", str(len(self.axes))
             )
+        if self.type == "grid" and self.cells != 256:
+            raise ConstraintError("cells", "256, as those of a grid are the axes'", str(self.cells))
+        for name, axis in self.axes.items():
+            if self.type == "cvt" and axis.cells != 10:
+                what = "10, as those of a cvt archive are its own"
+                raise ConstraintError(f"axes.{name}.cells", what, str(axis.cells))
         cells = math.prod(axis.cells for axis in self.axes.values())
         if self.type == "grid" and cells > _MOST_CELLS:
             raise ConstraintError("axes", f"at most {_MOST_CELLS:,} cells", f"{cells:,}")
@@ -192,6 +198,9 @@ class BodiesConfig(Settings):
             keeper = "an archive" if self.archive else "random"
             off = f"false, as {keeper} keeps individuals by one evaluation"
             raise ConstraintError("selection.reevaluate", off, "true")
+        if selection.elites != 1 and selection.type != "generational":
+            what = f"1, as only generational has elites (selection.type is {selection.type})"
+            raise ConstraintError("selection.elites", what, str(selection.elites))
         if len(selection.objectives) > 1 and selection.type != "nsga2":
             one = f"one, as only nsga2 takes several (selection.type is {selection.type})"
             raise ConstraintError("selection.objectives", one, ", ".join(selection.objectives))

@@ -319,6 +319,7 @@ class TaskConfig(Section):
         if self.target_turn is not None and not found:
             what = "three numbers [m], or target_distance, as there is a target_turn"
             raise ConstraintError("target", what, "none")
+        own = self.is_user_code
         needed = {
             "target_speed": ("target or target_distance", found),
             "target_spread": ("target_distance", self.target_distance),
@@ -326,6 +327,8 @@ class TaskConfig(Section):
             "course_changes": ("course_spread", self.course_spread),
             "course_rate": ("course_spread", self.course_spread),
             "course_turn": ("course_changes", self.course_changes),
+            "touch": ("search or escape", own or self.type in ("search", "escape")),
+            "height": ("follow_bed", own or self.type == "follow_bed"),
         }
         for name, (other, given) in needed.items():
             usual, value = type(self).model_fields[name].default, getattr(self, name)

@@ -143,6 +143,8 @@ class Fit:
             words = f"{v.low:.4g} to {v.high:.4g} ({LEVEL:.0%})" if v.found else "NOT FOUND"
             lines.append(f"# {v.name} {v.value:.4g} {v.unit}: {words}")
         lines += [f"# {u.words}." for u in self.unknown]
+        if any(m.params.get("factors") for m in self.problem.robot.morphology.modules):
+            lines.append("# On top of the factors that the robot had; robot.yaml has all of them.")
         return (
             "\n".join(lines)
             + "\n"
