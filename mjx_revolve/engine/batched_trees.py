@@ -21,8 +21,7 @@ lane by lane: XLA:CPU makes a branch of a choice between numbers in memory, and 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -58,7 +57,7 @@ class StackIndices(NamedTuple):
     apart: Any
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["data"], meta_fields=["tree"])
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PackedRow:
     """Numbers `[1, lanes]` side by side, so that they are copied as a whole.
@@ -69,7 +68,7 @@ class PackedRow:
     """
 
     data: Any
-    tree: Any
+    tree: Any = field(metadata={"static": True})
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,7 @@ subspace constant (Featherstone 2008, Rigid Body Dynamics Algorithms, § 4.4).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
@@ -207,7 +206,7 @@ class Parts:
         return self.carries or self.laws.memory > 0
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["position", "mass"], meta_fields=["count"])
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Points:
     """What may touch the bed, `[npoint, nbody, lanes]` or a number each.
@@ -218,16 +217,12 @@ class Points:
         mass: each point's share of its body's mass [kg]; 0 for padding.
     """
 
-    count: int
+    count: int = field(metadata={"static": True})
     position: Vec
     mass: Scalar
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["position", "rotation", "half_size"],
-    meta_fields=["count"],
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Shells:
     """Boxes that may meet others of the same robot, `[nshell, nbody, lanes]` or a number each.
@@ -239,27 +234,13 @@ class Shells:
         half_size: half edges [m].
     """
 
-    count: int
+    count: int = field(metadata={"static": True})
     position: Vec
     rotation: Mat
     half_size: Vec
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=[
-        "hinges",
-        "mass",
-        "moment",
-        "inertia",
-        "box",
-        "bound",
-        "parts",
-        "points",
-        "shells",
-    ],
-    meta_fields=["count"],
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Level:
     """Bodies that move together, `[nbody, lanes]` or a number each.
@@ -277,7 +258,7 @@ class Level:
         shells: what may meet other bodies of the same robot, or None.
     """
 
-    count: int
+    count: int = field(metadata={"static": True})
     hinges: Hinges | None
     mass: Scalar
     moment: Vec
@@ -305,14 +286,7 @@ class Level:
         return tuple(found)
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=[
-        "low", "high", "kept", "delayed", "backward", "forward", "dead_low", "dead_high", "line",
-        "disc",
-    ],
-    meta_fields=["count"],
-)  # fmt: skip
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Thrusters:
     """The thrusters of a robot, `[nthruster, lanes]` each.
@@ -332,7 +306,7 @@ class Thrusters:
         disc: area of the propeller's disc [m²].
     """
 
-    count: int
+    count: int = field(metadata={"static": True})
     low: Any
     high: Any
     kept: Any

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -149,13 +148,7 @@ def _mean(place: np.ndarray, weight: np.ndarray, owner: np.ndarray, count: int) 
     return moment / np.where(whole > 0, whole, 1.0)
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["low", "high", "place", "axis", "source", "first", "second", "mounts"],
-    meta_fields=[
-        "num_hinges", "num_thrusters", "num_pairs", "names", "pairs", "timestep", "modules", "rate",
-    ],
-)  # fmt: skip
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Plant:
     """The actuators of a robot, as controllers see them.
@@ -183,12 +176,12 @@ class Plant:
         rate: of commands, held in between [Hz]; None: one for each of the world's steps.
     """
 
-    num_hinges: int
-    num_thrusters: int
-    num_pairs: int
-    names: tuple[str, ...]
-    pairs: tuple[str, ...]
-    timestep: float
+    num_hinges: int = field(metadata={"static": True})
+    num_thrusters: int = field(metadata={"static": True})
+    num_pairs: int = field(metadata={"static": True})
+    names: tuple[str, ...] = field(metadata={"static": True})
+    pairs: tuple[str, ...] = field(metadata={"static": True})
+    timestep: float = field(metadata={"static": True})
     low: Any = None
     high: Any = None
     place: Any = None
@@ -197,8 +190,8 @@ class Plant:
     first: Any = None
     second: Any = None
     mounts: Any = field(default_factory=dict)
-    modules: ModuleSites | None = None
-    rate: float | None = None
+    modules: ModuleSites | None = field(default=None, metadata={"static": True})
+    rate: float | None = field(default=None, metadata={"static": True})
 
     def at_rate(self, rate: float) -> Plant:
         """The same for a controller that gives so many commands a second [Hz].

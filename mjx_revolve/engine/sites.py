@@ -7,8 +7,8 @@ type, for one robot and for many different ones.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -22,11 +22,7 @@ from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.numerics.spatial import Mat, Vec, clean
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["there", "position", "rotation"],
-    meta_fields=["row", "hinge", "module"],
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Sites:
     """Sites on rigid bodies: one on each, `[1 + hinge rows, lanes]`, or a single one, numbers.
@@ -46,9 +42,9 @@ class Sites:
     there: Any
     position: Vec
     rotation: Mat
-    row: int | None = None
-    hinge: int | None = None
-    module: int | None = None
+    row: int | None = field(default=None, metadata={"static": True})
+    hinge: int | None = field(default=None, metadata={"static": True})
+    module: int | None = field(default=None, metadata={"static": True})
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,13 +36,7 @@ from mjx_revolve.numerics.xla import is_traced, jit
 from mjx_revolve.water.flow import Water, water_of
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=[
-        "time", "qpos", "qvel", "xpos", "ctrl", "power", "command", "surface_height", "target",
-    ],
-    meta_fields=[],
-)  # fmt: skip
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, repr=False)
 class Trajectory:
     """Motion of one robot, one row after each step.

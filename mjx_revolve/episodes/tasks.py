@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial, reduce
 from typing import Any
 
@@ -39,15 +39,7 @@ _MOMENTS = 16
 _GIVEN = {"target": ("target", "target_distance"), "course": ("course_spread",)}
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=[
-        "position", "clearance", "energy", "start_height", "length", "weight", "surface_height",
-        "num_hinges", "quat", "velocity", "spin", "angle", "speed", "bed_force", "water_force",
-        "water_velocity", "target", "course",
-    ],
-    meta_fields=["interval"],
-)  # fmt: skip
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Track:
     """An episode of many individuals, sampled at equal intervals after the settling time.
@@ -85,7 +77,7 @@ class Track:
     position: jax.Array
     clearance: jax.Array
     energy: jax.Array
-    interval: float
+    interval: float = field(metadata={"static": True})
     start_height: jax.Array
     length: float
     weight: float
