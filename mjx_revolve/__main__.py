@@ -64,8 +64,7 @@ def _help() -> str:
     """All commands, examples, and what comes with the package."""
     configs = {name: _first_words(path) for name, path in list_shipped("configs").items()}
     robots = ", ".join(list_shipped("morphologies"))
-    folder = Path(__file__).with_name("water") / "worlds"
-    worlds = ", ".join(sorted(path.stem for path in folder.glob("*.yaml")))
+    worlds = ", ".join(list_shipped("worlds"))
     return "\n".join((
         f"usage: {program('COMMAND')} ...",
         "",

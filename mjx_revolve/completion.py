@@ -42,18 +42,11 @@ def make_script(shell: str) -> str:
         "configs": list_shipped("configs"),
         "kinds": KINDS,
         "morphologies": list_shipped("morphologies"),
-        "worlds": list_worlds(),
+        "worlds": list_shipped("worlds"),
     }
     plain = {key: [n for n in found if re.fullmatch(r"[\w.-]+", n)] for key, found in names.items()}
     script = _SCRIPT % {key: " ".join(found) for key, found in plain.items()}
     return _ZSH + script if shell == "zsh" else script
-
-
-def list_worlds() -> list[str]:
-    """Names of the worlds that come with the package."""
-    from pathlib import Path
-
-    return sorted(path.stem for path in Path(__file__).parent.glob("water/worlds/*.yaml"))
 
 
 def main(argv: list[str] | None = None) -> int:

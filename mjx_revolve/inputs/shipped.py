@@ -1,6 +1,6 @@
-"""Configurations and robots that come with the package, found by their names.
+"""Configurations, robots and worlds that come with the package, found by their names.
 
-They are at the top of a checkout, and inside an installed package.
+Worlds are inside the package, the others at the top of a checkout or inside an installed package.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from typing import Literal
 from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.files import check_path
 
-Kind = Literal["configs", "morphologies"]
+Kind = Literal["configs", "morphologies", "worlds"]
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def list_shipped(kind: Kind) -> dict[str, Path]:
     """Paths of the files that come with the package, by name, in alphabetical order."""
-    folders = (_PACKAGE / kind, _PACKAGE.parent / kind)
+    folders = (_PACKAGE / kind, _PACKAGE / "water" / kind, _PACKAGE.parent / kind)
     folder = next((folder for folder in folders if folder.is_dir()), folders[0])
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 

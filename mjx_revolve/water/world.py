@@ -36,6 +36,7 @@ from mjx_revolve.inputs.schema import (
     read,
     words,
 )
+from mjx_revolve.inputs.shipped import list_shipped
 from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.water.bed import Bed
 from mjx_revolve.water.coefficients import TODAY
@@ -58,7 +59,6 @@ from mjx_revolve.water.law_names import (
 from mjx_revolve.water.plates import LiftDrag
 
 _DENSITIES = 600, 1500  # of what robots can be meant to swim in [kg/m³]
-_FOLDER = Path(__file__).parent / "worlds"
 
 
 @checked
@@ -257,11 +257,11 @@ def load_world(name: str | Path, **overrides: Any) -> World:
 
 def _find_world(name: str | Path) -> Path:
     """The file of a world."""
-    shipped = sorted(path.stem for path in _FOLDER.glob("*.yaml"))
     if not isinstance(name, str | Path):
         raise InputError(f"world: expected a name or a path; found {show(name)}")
     check_path(name)
-    path = _FOLDER / f"{name}.yaml" if str(name) in shipped else Path(name)
+    shipped = list_shipped("worlds")
+    path = shipped.get(str(name), Path(name))
     if not path.exists() and path.suffix not in (".yaml", ".yml"):
         raise InputError(
             f"world: expected one of {', '.join(shipped)} or a YAML file; found {str(name)!r}"
