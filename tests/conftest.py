@@ -2,14 +2,18 @@
 
 import atexit
 import gc
+import math
 import os
 import shutil
 import tempfile
 from collections import Counter
+from pathlib import Path
 
 # One cache of compiled programs for the session: its workers, the commands that tests run, and the
 # processes that they start, compile a program once, and the user's own cache stays as it is. XLA's
-# flags are part of a program's name there. Set before JAX is loaded, which reads it then.
+# flags are part of a program's name there. Small programs are kept, too: there are thousands of
+# them. Set before JAX is loaded, which reads it then.
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="mjx_revolve_tests_")
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
@@ -62,17 +66,40 @@ def quick_compiles():
         yield
 
 
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Runs end without their plots, which take a second each."""
+    monkeypatch.setattr("mjx_revolve.view.results.save_pictures", lambda run, champion: None)
+
+
+@pytest.fixture
+def float64():
+    """What is compared is exact but for rounding."""
+    with jax.enable_x64(True):
+        yield
+
+
 @pytest.fixture(autouse=True)
 def no_kept_programs(monkeypatch):
     """Tests change what programs are made of; processes that they start keep theirs."""
     monkeypatch.setattr(runtime, "program_folder", lambda: None)
 
 
+def _memory() -> float:
+    """What this process holds in memory [bytes]; infinite where the system does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return math.inf
+    return float(pages * os.sysconf("SC_PAGE_SIZE"))
+
+
 @pytest.fixture(scope="module", autouse=True)
 def fresh_traces():
-    """Forgets traces after each file, and with them the memory that they hold."""
+    """Forgets traces after a file where they hold much memory: the next file can use them."""
     yield
-    jax.clear_caches()
+    if _memory() > 3e9:
+        jax.clear_caches()
 
 
 # Files are dealt out whole, in this order: those that take longest go first, so that no worker is

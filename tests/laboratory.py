@@ -7,7 +7,7 @@ discretisation errs by and not what float32 rounds to.
 import copy
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,8 @@ from mjx_revolve.control.controller import Controller
 from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot, build_robot
+from mjx_revolve.episodes.tasks import Track
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.xla import OLD_EMITTERS, on_cpu
 from mjx_revolve.water.face_drag import FACES, FaceNumbers
 from mjx_revolve.water.world import World
@@ -144,6 +146,16 @@ def check_engines(robot: Robot, qpos: np.ndarray, qvel: np.ndarray, ctrl: np.nda
     assert other_work == pytest.approx(work, abs=1e-9)
 
 
+def check_refused(
+    message: str, function: Callable[..., Any], *given: Any, start: str = "", **more: Any
+) -> None:
+    """A call ends in an `InputError` of one line, with a message in it and a start."""
+    with pytest.raises(InputError) as error:
+        function(*given, **more)
+    found = str(error.value)
+    assert message in found and found.startswith(start) and "\n" not in found, found
+
+
 def with_motors(robot: Robot, factor: float) -> Robot:
     """The robot with other top speeds of its motors."""
     model = copy.copy(robot.mj_model)
@@ -178,12 +190,17 @@ body:
 """
 
 
+def write(folder: Path, text: str, name: str = "robot.yaml") -> Path:
+    """A new file with a text."""
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
 def read(text: str) -> Morphology:
     """A morphology from the text of its YAML."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "robot.yaml"
-        path.write_text(text)
-        return load_morphology(path)
+        return load_morphology(write(Path(folder), text))
 
 
 def swimmer(folder: Path, robot: str, task: dict[str, Any]) -> dict[str, Any]:
@@ -197,15 +214,34 @@ def swimmer(folder: Path, robot: str, task: dict[str, Any]) -> dict[str, Any]:
     Returns:
         What `make_fitness` takes.
     """
-    path = folder / "robot.yaml"
-    path.write_text(robot)
     return {
-        "morphology": str(path),
+        "morphology": str(write(folder, robot)),
         "world": "lake",
         "trim": "neutral",
         "controller": {"type": "sine"},
         "task": task,
     }
+
+
+def make_track(position: Any, interval: float = 1.0, **more: Any) -> Track:
+    """A track of one individual, half a metre long.
+
+    Args:
+        position: `[S, 3]` [m].
+        interval: between rows [s].
+        more: other records, `[S]` or `[S, n]`; these and the position get a lane.
+    """
+    ones = np.ones(len(position))
+    lanes = {"position": position, "clearance": ones, "energy": ones} | more
+    return Track(
+        interval=interval,
+        start_height=jnp.zeros(1),
+        length=0.5,
+        weight=2.0,
+        surface_height=3.0,
+        num_hinges=np.shape(more["angle"])[1] if "angle" in more else 0,
+        **{name: jnp.asarray(np.asarray(x, np.float32)[..., None]) for name, x in lanes.items()},
+    )
 
 
 def check_slope_at_rest(controller: Controller, plant: Plant, sense: SensorReadings) -> None:

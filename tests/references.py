@@ -5,6 +5,8 @@ import itertools
 import mujoco
 import numpy as np
 
+from mjx_revolve.water.bed import bed_height
+
 # A cube cut into six tetrahedra around one diagonal (Kuhn): corners as indices into (0, 1)³.
 _KUHN = [
     [np.zeros(3), *np.cumsum(np.eye(3)[list(order)], axis=0)]
@@ -124,3 +126,27 @@ class Lagrangian:
         result -= [qvel @ rate(e) @ qvel / 2 for e in np.eye(len(qvel))]
         result[3:6] += np.cross(qvel[3:6], momentum[3:6])
         return result
+
+
+def clearance(robot, qpos):
+    """`[T]` height of the lowest corner above the bed, negative inside [m]."""
+    data, found = mujoco.MjData(robot.mj_model), []
+    for q in qpos:
+        data.qpos[:] = q
+        mujoco.mj_kinematics(robot.mj_model, data)
+        turn = data.xmat[robot.contact_body].reshape(-1, 3, 3)
+        corner = data.xpos[robot.contact_body]
+        corner = corner + np.einsum("nij,nj->ni", turn, robot.contact_position)
+        found.append(np.min(corner[:, 2] - bed_height(robot.world.bed, *corner[:, :2].T)))
+    return np.array(found)
+
+
+def rotation(quat):
+    """`[..., 3, 3]` of unit quaternions `[..., 4]`."""
+    w, x, y, z = np.moveaxis(np.asarray(quat), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)

@@ -25,9 +25,7 @@ save_pictures = results.save_pictures
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """Runs end without their plots, which take a second each."""
-    monkeypatch.setattr(results, "save_pictures", lambda start, champion: None)
+def folder(tmp_path, monkeypatch, no_pictures):
     return toys.enter_folder(tmp_path, monkeypatch)
 
 

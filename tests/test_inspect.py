@@ -4,7 +4,6 @@ import os
 from pathlib import Path
 
 import pytest
-import yaml
 
 from laboratory import ROOT
 from mjx_revolve import inspect
@@ -13,29 +12,7 @@ from mjx_revolve.body.table import thruster_table
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 
-
-def _leg() -> dict:
-    """Hinge, brick, hinge, brick, as in Revolve's spider."""
-    foot = {"id": "foot", "type": "FixedBrick"}
-    ankle = {"id": "ankle", "type": "ActiveHinge", "children": {1: foot}}
-    shin = {"id": "shin", "type": "FixedBrick", "orientation": -90, "children": {1: ankle}}
-    return {"id": "hip", "type": "ActiveHinge", "orientation": 90, "children": {1: shin}}
-
-
-def _rename(module: dict, suffix: int) -> dict:
-    children = {slot: _rename(child, suffix) for slot, child in module.get("children", {}).items()}
-    return module | {"id": f"{module['id']}{suffix}"} | ({"children": children} if children else {})
-
-
-@pytest.fixture
-def spider(tmp_path) -> Path:
-    """A file with the thesis's spider."""
-    legs = {slot: _rename(_leg(), slot) for slot in range(4)}
-    params = {"red": 0.04, "green": 0.26, "blue": 0.72}
-    body = {"id": "core", "type": "Core", "params": params, "children": legs}
-    path = tmp_path / "spider.yaml"
-    path.write_text(yaml.safe_dump({"id": "spider", "body": body}))
-    return path
+SPIDER = ROOT / "morphologies" / "spider.yaml"
 
 
 def run(*arguments: object) -> int:
@@ -54,8 +31,8 @@ def _is_png(path: Path) -> bool:
     return data.startswith(b"\x89PNG\r\n\x1a\n") and data.endswith(b"IEND\xaeB`\x82")
 
 
-def test_the_spider_weighs_what_the_thesis_says(spider, capsys):
-    assert run(spider) == 0
+def test_the_spider_weighs_what_the_thesis_says(capsys):
+    assert run(SPIDER) == 0
     out = capsys.readouterr().out
     assert _value(out, "modules") == 17
     assert _value(out, "hinges") == 8
@@ -68,10 +45,10 @@ def test_the_spider_weighs_what_the_thesis_says(spider, capsys):
     assert "(sinks)" in out
 
 
-def test_descriptors_are_listed(spider, capsys):
-    assert run(spider) == 0
+def test_descriptors_are_listed(capsys):
+    assert run(SPIDER) == 0
     out = capsys.readouterr().out
-    for key, value in load_morphology(spider).descriptors.items():
+    for key, value in load_morphology(SPIDER).descriptors.items():
         assert _value(out, f"  {key} ") == pytest.approx(float(value), rel=1e-5)
 
 
@@ -91,10 +68,10 @@ def test_thrusters_are_listed_with_what_they_do(capsys):
     ]  # fmt: skip
 
 
-def test_centres_of_mass_and_volume_are_shown(spider, capsys):
-    assert run(spider) == 0
+def test_centres_of_mass_and_volume_are_shown(capsys):
+    assert run(SPIDER) == 0
     out = capsys.readouterr().out
-    assert "centre of mass at rest" in out and thruster_table(load_morphology(spider)) == []
+    assert "centre of mass at rest" in out and thruster_table(load_morphology(SPIDER)) == []
     assert run(ROOT / "morphologies" / "fish.yaml") == 0
     out = capsys.readouterr().out
     (mass,), (volume,) = (
@@ -107,14 +84,14 @@ def test_centres_of_mass_and_volume_are_shown(spider, capsys):
 
 
 @pytest.mark.slow
-def test_the_picture_is_a_whole_png_in_the_robots_colours(spider, tmp_path):
+def test_the_picture_is_a_whole_png_in_the_robots_colours(tmp_path):
     from matplotlib.image import imread
 
     folder = tmp_path / "pictures"
     folder.mkdir()
     picture = folder / "spider.png"
     picture.write_text("old")
-    assert run(spider, "--picture", picture) == 0
+    assert run(SPIDER, "--picture", picture) == 0
     assert _is_png(picture)
     assert os.listdir(folder) == ["spider.png"]
     pixels = imread(picture)[..., :3]
@@ -136,17 +113,17 @@ def test_the_picture_is_a_whole_png_in_the_robots_colours(spider, tmp_path):
          "'.jpg'")
 ],
 )  # fmt: skip
-def test_bad_arguments_are_one_line_and_code_2(spider, tmp_path, capsys, arguments, message):
+def test_bad_arguments_are_one_line_and_code_2(tmp_path, capsys, arguments, message):
     (tmp_path / "folder.png").mkdir()
     before = sorted(os.listdir(tmp_path))
-    assert run(spider, *(argument.format(tmp=tmp_path) for argument in arguments)) == 2
+    assert run(SPIDER, *(argument.format(tmp=tmp_path) for argument in arguments)) == 2
     captured = capsys.readouterr()
     assert captured.err == f"error: {message.format(tmp=tmp_path)}\n"
     assert captured.out == ""
     assert sorted(os.listdir(tmp_path)) == before
 
 
-def test_a_picture_that_cannot_be_written_leaves_nothing(spider, tmp_path, monkeypatch):
+def test_a_picture_that_cannot_be_written_leaves_nothing(tmp_path, monkeypatch):
     from matplotlib.figure import Figure
 
     from mjx_revolve.view import pictures
@@ -159,5 +136,5 @@ def test_a_picture_that_cannot_be_written_leaves_nothing(spider, tmp_path, monke
     monkeypatch.setattr(pictures, "_compose", lambda morphology: Figure())
     picture = tmp_path / "spider.png"
     with pytest.raises(InputError, match="expected a writable file; found No space left on device"):
-        pictures.draw_morphology(load_morphology(spider), picture)
-    assert os.listdir(tmp_path) == ["spider.yaml"]
+        pictures.draw_morphology(load_morphology(SPIDER), picture)
+    assert os.listdir(tmp_path) == []

@@ -31,7 +31,6 @@ TINY = [
 @pytest.fixture
 def started(monkeypatch):
     """A fitness that costs nothing; what was run."""
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
     monkeypatch.setattr(studies, "MAKE_FITNESS", make_toy_bodies)
     commands = []
     run_plans = studies.run_plans

@@ -24,17 +24,10 @@ RUNS = [f"{case}/seed_{seed}" for case in CASES for seed in (0, 1)]
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with a config, current; the compilation cache off."""
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    """A folder with a config, current."""
     monkeypatch.chdir(tmp_path)
     toys.write_config(tmp_path / "toy.yaml", population_size=8, generations=5, checkpoint_every=2)
     return tmp_path
-
-
-@pytest.fixture
-def no_pictures(monkeypatch):
-    """Runs end without their plots, which take a second each."""
-    monkeypatch.setattr("mjx_revolve.view.results.save_pictures", lambda start, champion: None)
 
 
 def run_sweep(*argv, make_fitness=make_toy):

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.evolution.body_fitness import BodyFitness, make_body_fitness
+from mjx_revolve.evolution.executor import Executor
 from mjx_revolve.evolution.run_folder import RunFolder
 
 # In metrics.csv, all but these is reproducible.
@@ -34,8 +35,7 @@ def write_config(path: Path, **evolution) -> Path:
 
 
 def enter_folder(path: Path, monkeypatch) -> Path:
-    """A folder with a configuration, current; the compilation cache off."""
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+    """A folder with a configuration, current."""
     monkeypatch.chdir(path)
     write_config(path / "toy.yaml", population_size=8, checkpoint_every=2)
     return path
@@ -210,3 +210,15 @@ class BodyToy(BodyFitness):
 def make_toy_bodies(config):
     made = make_body_fitness(config)
     return BodyToy(made.config, made.genotype, made.mixed, made.brains, made.seeds)
+
+
+def check_scores(executor: Executor, seed: int, size: int = 22) -> None:
+    """The same bits as in this process."""
+    population = np.random.default_rng(seed).normal(size=(size, 5)).astype(np.float32)
+    key = jax.random.key(seed)
+    scores, measures = executor.evaluate(population, key)
+    alone, alone_measures = Executor(Toy(), 4).evaluate(population, key)
+    assert scores.dtype == np.float32 and scores.shape == (size,)
+    assert measures.keys() == alone_measures.keys() == {"distance_m"}
+    assert scores.tobytes() == alone.tobytes()
+    assert measures["distance_m"].tobytes() == alone_measures["distance_m"].tobytes()

@@ -50,9 +50,9 @@ def edited_assembly(assembly: Assembly, model: mujoco.MjModel) -> Assembly:
     """An assembly of one robot with the masses, inertias and hinges' ranges of a model."""
     axes = quat_to_matrix(model.body_iquat)
     joint, reach = model.body_jntadr[2:], assembly.range.copy()
-    # Where a hinge without a limit meets its neighbours is looked for within a turn.
-    turn = _limits(model.jnt_range[joint], model.jnt_limited[joint])
-    reach[2:] = np.clip(turn, -np.pi, np.pi)
+    # A hinge that an edit frees of its limits has no end stop, not even where neighbours meet.
+    limited = model.jnt_limited[joint].astype(bool)[:, None]
+    reach[2:] = np.where(limited, model.jnt_range[joint], reach[2:])
     return replace(
         assembly,
         mass=model.body_mass.copy(),
@@ -83,9 +83,9 @@ def edited_constants(
     dof = model.jnt_dofadr[joint]
     effort = _limits(model.actuator_forcerange[act], model.actuator_forcelimited[act])
     target = _limits(model.actuator_ctrlrange[act], model.actuator_ctrllimited[act])
-    free = ~model.jnt_limited[joint].astype(bool)
+    limited = model.jnt_limited[joint].astype(bool)[:, None]
     stops = np.stack([np.asarray(x, float)[2:] for x in constants.hinges.range], 1)
-    limits = np.where(free[:, None], [-np.inf, np.inf], stops)
+    limits = np.where(limited, stops, [-np.inf, np.inf])
     strong = np.where(np.isfinite(effort[:, 1]), effort[:, 1], 1.0)
     motor = motor_line(model.jnt_user[joint, 0], effort[:, 1], model.dof_damping[dof])
 

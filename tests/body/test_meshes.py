@@ -10,6 +10,7 @@ import trimesh
 
 from experiments import module_volumes as experiment
 from experiments.meshes import check_mesh, load_mesh, mesh_center_of_volume, mesh_volume
+from laboratory import check_refused
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.solids import part_mesh
 from mjx_revolve.inputs.errors import InputError
@@ -196,10 +197,7 @@ def test_paths_inside_the_folder_are_read(tmp_path):
 )  # fmt: skip
 def test_bad_files_are_refused(tmp_path, path, message):
     folder = _folder(tmp_path)
-    with pytest.raises(InputError) as error:
-        load_mesh(path, folder=folder)
-    assert str(error.value).startswith(message.format(folder=folder))
-    assert "\n" not in str(error.value)
+    check_refused("", load_mesh, path, folder=folder, start=message.format(folder=folder))
 
 
 def test_a_large_file_is_refused(tmp_path):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from laboratory import ROOT
+from laboratory import OURS, ROOT, body, check_refused, write
 from mjx_revolve.body.catalogue import MODULES, THESIS_MODULES, LiftDrag
 from mjx_revolve.body.coefficients import read_morphology_files
 from mjx_revolve.body.exposure import exposure
@@ -25,25 +25,14 @@ from mjx_revolve.body.morphology import (
 )
 from mjx_revolve.inputs.errors import InputError
 
-OURS = sorted((ROOT / "morphologies").glob("*.yaml"))
 WILD_FOLDER = ROOT.parent / "shared" / "revolve_robots"
 WATER = 999.1026  # kg/m³, the thesis's
-
-
-def ours(name: str) -> Morphology:
-    return load_morphology(ROOT / "morphologies" / f"{name}.yaml")
 
 
 def wild(name: str) -> Path:
     path = WILD_FOLDER / f"{name}.yaml"
     if not path.exists():
         pytest.skip("Revolve's own robots (../shared/revolve_robots) are not on this machine")
-    return path
-
-
-def write(folder: Path, text: str, name: str = "robot.yaml") -> Path:
-    path = folder / name
-    path.write_text(text, encoding="utf-8")
     return path
 
 
@@ -59,7 +48,7 @@ LEGS = {0: (0, -1, 0), 1: (0, 1, 0), 2: (1, 0, 0), 3: (-1, 0, 0)}
 
 @pytest.fixture(params=["ours", "Revolve's"])
 def spider(request) -> Morphology:
-    return ours("spider") if request.param == "ours" else load_morphology(wild("spider"))
+    return body("spider") if request.param == "ours" else load_morphology(wild("spider"))
 
 
 def leg(morphology: Morphology, slot: int) -> list:
@@ -120,10 +109,10 @@ def test_thesis_masses_move_between_links_only():
     path = ROOT / "morphologies" / "spider.yaml"
     thesis = load_morphology(path, modules=THESIS_MODULES)
     assert thesis.mass == pytest.approx(0.2572, abs=1e-12)
-    assert thesis.volume == ours("spider").volume
+    assert thesis.volume == body("spider").volume
     masses = [0.0119] * 4 + [0.0209] * 4 + [0.126]
     assert link_masses(thesis) == pytest.approx(masses)
-    assert thesis != ours("spider")
+    assert thesis != body("spider")
 
 
 def test_spider_hinges_share_links(spider):
@@ -136,8 +125,8 @@ def test_spider_hinges_share_links(spider):
 
 
 def test_hinge_neighbours_of_a_chain_and_of_none():
-    assert ours("core").hinge_neighbours() == ()
-    snake = ours("snake")
+    assert body("core").hinge_neighbours() == ()
+    snake = body("snake")
     assert len(snake.hinge_neighbours()) == 7  # eight in a row, the core's link in the middle
 
 
@@ -361,7 +350,7 @@ def test_a_dead_band_is_scaled_on_both_sides(tmp_path):
 
 @pytest.mark.parametrize("name", ["auv", "fish"])
 def test_swimmers_with_ballast_are_neutral_level_and_upright(name):
-    robot = ours(name)
+    robot = body(name)
     assert robot.volume * WATER == pytest.approx(robot.mass, rel=1e-9)
     apart = robot.center_of_volume - robot.center_of_mass
     assert apart[:2] == pytest.approx([0, 0], abs=1e-7)
@@ -369,7 +358,7 @@ def test_swimmers_with_ballast_are_neutral_level_and_upright(name):
 
 
 def test_trim_neutral(tmp_path):
-    robot = ours("spider")
+    robot = body("spider")
     trimmed = trim_neutral(robot, WATER)
     assert trimmed.volume * WATER == pytest.approx(trimmed.mass, rel=1e-12)
     assert trimmed.mass == robot.mass and trimmed.modules[1:] == robot.modules[1:]
@@ -610,12 +599,7 @@ JET_ON = "body: {type: Core, children: {1: {type: Thruster, params: {%s}}}}"
     ],
 )
 def test_wrong_files_are_refused(tmp_path, text, message):
-    with pytest.raises(InputError) as error:
-        read(tmp_path, text)
-    found = str(error.value)
-    assert message in found
-    assert found.startswith(f"{tmp_path / 'robot.yaml'}: ")
-    assert "\n" not in found
+    check_refused(message, read, tmp_path, text, start=f"{tmp_path / 'robot.yaml'}: ")
 
 
 def test_a_mapping_is_refused_as_a_file_is():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from laboratory import read, world
+from laboratory import check_refused, read, world
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.control.neurons import evolve_brain, make_neural_network
@@ -148,9 +148,8 @@ def changed(pattern, text):
 )  # fmt: skip
 def test_wrong_networks(pattern, text, message):
     robot = build_robot(read(changed(pattern, text)), world())
-    with pytest.raises(InputError) as caught:
-        make_neural_network(plant_of(robot), robot.morphology, "mine.yaml")
-    assert f"mine.yaml: {message}" in str(caught.value)
+    given = plant_of(robot), robot.morphology, "mine.yaml"
+    check_refused(f"mine.yaml: {message}", make_neural_network, *given)
 
 
 def test_what_a_file_may_have_for_a_brain(robot):
@@ -167,8 +166,6 @@ def test_what_a_file_may_have_for_a_brain(robot):
         ("null", "rlpower-splines; found none"),
         ("{learner: x}", "rlpower-splines; found {'learner': 'x'}"),
     ):  # fmt: skip
-        with pytest.raises(InputError) as caught:
-            find(brain)
-        assert message in str(caught.value)
+        check_refused(message, find, brain)
     with pytest.raises(InputError, match=r"run.yaml: controller.type: expected another one, as"):
         find_controller(plant, settings, "run.yaml")

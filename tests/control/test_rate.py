@@ -1,7 +1,6 @@
 """Controllers at a rate of their own: what is commanded depends on no timestep of the world."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,20 +11,12 @@ from laboratory import elbow_robot, world
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.plant import plant_of
-from mjx_revolve.episodes.config import (
-    OLDER_WORLD,
-    ControllerConfig,
-    dump_config,
-    load_config,
-    make_config,
-)
-from mjx_revolve.evolution.fingerprints import settings_hash
+from mjx_revolve.episodes.config import ControllerConfig, load_config
 from mjx_revolve.inputs.errors import InputError
 
 BLIND = SensorReadings(np.zeros(3), np.zeros(3), (), ())
 GENES = np.random.default_rng(0).normal(size=(40, 3))
 LENGTH = 3.0
-SPIDER = Path(__file__).parents[2] / "morphologies" / "spider.yaml"
 
 
 @pytest.fixture(scope="module")
@@ -104,31 +95,8 @@ def test_a_cpgs_frequency_depends_neither_on_the_rate_nor_on_the_step(plant):
                 assert found[number, :, lane] == pytest.approx(np.pi / 4 * np.tanh(x), abs=1e-8)
 
 
-def test_older_runs_have_no_rate_and_keep_their_fingerprint(tmp_path):
-    config = make_config(
-        {"morphology": str(SPIDER), "world": "lake", "task": {"type": "speed"}},
-        overrides={"controller.rate": None, "controller.between": "hold"},
-    )
-    text, lines = dump_config(config), 0
-    for line in ("rate: null", "between: hold"):
-        lines += text.count(line)
-        text = text.replace(f"{line},", "").replace(line, "")
-    assert lines == 2
-    (tmp_path / "run.json").write_text("{}")
-    (tmp_path / "config.yaml").write_text(text)
-    older = load_config(tmp_path / "config.yaml")
-    assert (older.controller.rate, older.controller.between) == (None, "hold")
-    assert settings_hash(older, older_world=OLDER_WORLD) == settings_hash(config)
-    assert settings_hash(load_config(tmp_path / "config.yaml", {"controller.rate": 20.0})) != (
-        settings_hash(config)
-    )
-
-
 def test_a_wave_that_cannot_be_sampled_is_refused():
     with pytest.raises(
         InputError, match=r"max_frequency: expected at most half of controller.rate"
     ):
-        make_config(
-            {"morphology": str(SPIDER), "world": "lake", "task": {"type": "speed"}},
-            overrides={"controller.max_frequency": 11.0},
-        )
+        load_config("smoke", {"controller.max_frequency": 11.0})

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import OAR, ROOT, read
+from laboratory import OAR, ROOT, check_refused, read
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.body.sensors import SENSORS, Sensor, SensorRow
 from mjx_revolve.control.readings import SensorReadings
@@ -142,9 +142,7 @@ def test_a_robots_sensors_are_read_and_saved(tmp_path):
 ],
 )  # fmt: skip
 def test_wrong_sensors(sensors, message):
-    with pytest.raises(InputError) as caught:
-        schema.read(SensorRow, sensors, "sensors")
-    assert message in str(caught.value)
+    check_refused(message, schema.read, SensorRow, sensors, "sensors")
 
 
 def test_a_delay_of_too_many_samples():

@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 from experiments.random_bodies import random_body
-from laboratory import ROOT, read
+from laboratory import OURS, ROOT, WILD, read
 from mjx_revolve import build_robot, load_morphology, load_world, make_mixed_fitness
 from mjx_revolve.body.morphology import trim_neutral
 from mjx_revolve.engine.assembly import assemble
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.mujoco_model import compile_model
 from mjx_revolve.engine.step_constants import read_constants
+from references import rotation
 
 # Fins, thrusters before and behind hinges, a point ballast, a plate that is its own body.
 ODD = """
@@ -36,8 +37,6 @@ body:
     2: {type: FixedBrick, children: {2: {type: ActiveHinge, children: {1: {type: LiftThruster}}}}}
     3: {type: ActiveHinge, orientation: 270, children: {1: {type: FixedBrick}}}
 """
-WILD = sorted((ROOT.parent / "shared" / "revolve_robots").glob("*.yaml"))
-OURS = sorted((ROOT / "morphologies").glob("*.yaml"))
 
 
 def bodies():
@@ -60,13 +59,6 @@ def close(found, expected):
     assert np.abs(found - expected).max(initial=0) <= 1e-12 * np.abs(expected).max(initial=1e-9)
 
 
-def matrices(quats):
-    found = np.zeros((len(quats), 9))
-    for matrix, quat in zip(found, quats, strict=True):
-        mujoco.mju_quat2Mat(matrix, quat)
-    return found.reshape(-1, 3, 3)
-
-
 def test_numbers_are_those_of_mujocos_model():
     assert len(robots()) >= 10
     for robot in robots():
@@ -80,13 +72,13 @@ def test_numbers_are_those_of_mujocos_model():
         assert not m.jnt_pos.any() and not m.dof_armature.any()
         close(ours.mass, m.body_mass)
         close(ours.center, m.body_ipos)
-        axes = matrices(m.body_iquat)
+        axes = rotation(m.body_iquat)
         inertia = axes * m.body_inertia[:, None] @ axes.swapaxes(1, 2)
         for found, expected in zip(ours.inertia, inertia, strict=True):
             close(found, expected)
-        position, rotation = ours.from_parents()
+        position, turn = ours.from_parents()
         close(position, m.body_pos)
-        close(rotation, matrices(m.body_quat))
+        close(turn, rotation(m.body_quat))
         data = mujoco.MjData(m)
         mujoco.mj_kinematics(m, data)
         close(ours.position, data.xpos)
@@ -120,7 +112,7 @@ def test_the_inertia_box_is_that_of_mujocos_principal_axes():
         i = m.body_inertia[1:]
         size = np.sqrt(6 * (i[:, [1, 0, 0]] + i[:, [2, 2, 1]] - i) / m.body_mass[1:, None])
         found = np.array(box.rotation).transpose(2, 0, 1)
-        axes = columns.frame[1:].swapaxes(1, 2) @ matrices(m.body_iquat)[1:]
+        axes = columns.frame[1:].swapaxes(1, 2) @ rotation(m.body_iquat)[1:]
         assert np.stack(box.size, 1)[1:] == pytest.approx(size, rel=1e-9)
         # Which way along an axis does not matter.
         assert np.abs(found[1:].swapaxes(1, 2) @ axes) == pytest.approx(

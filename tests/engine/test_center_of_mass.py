@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 
 from experiments.random_bodies import random_body
-from laboratory import body, need_mjx, random_states, read, world
+from laboratory import WATER, body, need_mjx, random_states, read, world
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.kinematics import body_poses, mass_centers
 from mjx_revolve.engine.plant import body_geometry
 from mjx_revolve.engine.robot import build_robot
-
-WATER = {"gravity": 9.81, "buoyancy": "partial", "drag": "faces", "added_mass": True}
 
 
 def mujocos(robot, qpos):

@@ -29,11 +29,7 @@ from mjx_revolve.water.flow import water_of
 NAMES = ("spider", "fish", "snake")
 
 
-@pytest.fixture(autouse=True)
-def float64():
-    """What these tests compare is exact but for rounding."""
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 @lru_cache(maxsize=1)

@@ -2,7 +2,6 @@
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
@@ -11,28 +10,13 @@ from mjx_revolve.engine.contact import bed_contact, bed_plane
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.water.bed import Bed, bed_height, bed_slope
 from mjx_revolve.water.world import load_world
-from references import Lagrangian
+from references import Lagrangian, clearance
 
 RHO, G = 999.1026, 9.81
 LAKE = load_world("lake").bed
 FLAT = Bed(kind="flat", height=-2.0)
 # Places in the lake by the tangent of their slope; the bed's friction is 0.6.
 LEVEL, GENTLE, STEEP = (0.0, 0.0), (200.0, 50.0), (150.0, -250.0)
-
-
-def lowest(robot, qpos):
-    """Clearance of the lowest corner of any module above the bed, negative inside [m]."""
-    data = mujoco.MjData(robot.mj_model)
-    found = []
-    for q in qpos:
-        data.qpos[:] = q
-        mujoco.mj_kinematics(robot.mj_model, data)
-        turn = data.xmat[robot.contact_body].reshape(-1, 3, 3)
-        corner = data.xpos[robot.contact_body] + np.einsum(
-            "nij,nj->ni", turn, robot.contact_position
-        )
-        found.append(np.min(corner[:, 2] - bed_height(robot.world.bed, *corner[:, :2].T)))
-    return np.array(found)
 
 
 def sink(bed, name="core", **fields):
@@ -132,7 +116,7 @@ def test_a_core_lands_on_a_flat_bed_and_stays():
     robot = sink(FLAT)
     qpos, qvel = above(robot, [(0.0, 0.0)] * 8, 0.5)
     _, q, v, _ = march(robot, 10.0, qpos, qvel, every=4)
-    clear = np.array([lowest(robot, q[:, :, lane]) for lane in range(8)]).T
+    clear = np.array([clearance(robot, q[:, :, lane]) for lane in range(8)]).T
     assert clear.min() > -8e-3
     assert np.abs(v[-1]).max() < 1e-4
     assert np.all((clear[-1] > -1e-3) & (clear[-1] < 0))
@@ -176,7 +160,7 @@ def test_a_spider_lands_and_stays(bed):
     qpos, qvel = above(robot, places, 0.5)
     qpos[3:7, 0] = 1, 0, 0, 0
     _, q, v, _ = march(robot, 15.0, qpos, qvel, every=20, x64=False)
-    clear = np.array([lowest(robot, q[:, :, lane]) for lane in range(4)])
+    clear = np.array([clearance(robot, q[:, :, lane]) for lane in range(4)])
     assert np.all(np.isfinite(v))
     assert clear.min() > -0.015
     assert np.all((clear[:, -1] > -0.003) & (clear[:, -1] < 0.001))

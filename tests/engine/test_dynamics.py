@@ -31,7 +31,7 @@ from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.bed import Bed
 from mjx_revolve.water.face_drag import FACES
 from mjx_revolve.water.flow import Water
-from references import clip_box
+from references import clip_box, rotation
 
 NO_LIMITS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
 MUJOCO_LAWS = ["off", "inertia_box", "ellipsoid"]
@@ -129,12 +129,10 @@ def slanted(text):
     morphology = read(text)
     modules = []
     for k, module in enumerate(morphology.modules):
-        turn, quat = np.zeros(9), np.zeros(4)
+        quat = np.zeros(4)
         axis = np.array([1.0, 2.0, -2.0]) / 3
         mujoco.mju_axisAngle2Quat(quat, axis, np.radians(20.0 * k))
-        mujoco.mju_quat2Mat(turn, quat)
-        rotation = module.rotation @ turn.reshape(3, 3)
-        modules.append(dataclasses.replace(module, rotation=rotation))
+        modules.append(dataclasses.replace(module, rotation=module.rotation @ rotation(quat)))
     return dataclasses.replace(morphology, modules=tuple(modules))
 
 

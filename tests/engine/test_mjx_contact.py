@@ -15,7 +15,7 @@ from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.bed import Bed, bed_height
 from mjx_revolve.water.flow import Water
 from mjx_revolve.water.world import load_world
-from references import Lagrangian
+from references import Lagrangian, clearance
 
 RHO, G, MU = 999.1026, 9.81, 0.4
 FLAT = {"kind": "flat", "height": -2.0, "friction": MU, "contact": "mjx"}
@@ -43,19 +43,6 @@ def sunk(robot, weight):
         d = 0.9 + 0.05 * 2 * (depth / 1e-3) ** 2
         depth = weight / 4 * inverse * (1 - d) / d / (d / (0.95 * 0.02) ** 2)
     return depth
-
-
-def clearance(robot, qpos):
-    """`[T]` height of the lowest corner above the bed, negative inside [m]."""
-    data, found = mujoco.MjData(robot.mj_model), []
-    for q in qpos:
-        data.qpos[:] = q
-        mujoco.mj_kinematics(robot.mj_model, data)
-        turn = data.xmat[robot.contact_body].reshape(-1, 3, 3)
-        corner = data.xpos[robot.contact_body]
-        corner = corner + np.einsum("nij,nj->ni", turn, robot.contact_position)
-        found.append(np.min(corner[:, 2] - bed_height(robot.world.bed, *corner[:, :2].T)))
-    return np.array(found)
 
 
 def test_the_setting():

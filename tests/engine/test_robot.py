@@ -18,20 +18,9 @@ from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.bed import Bed, bed_height
 from mjx_revolve.water.lift_drag import LIFT_DRAG
 from mjx_revolve.water.world import load_world
+from references import rotation
 
 EFFORT, SPEED = 0.17658, 5.235988
-# Along one leg of the spider from the core's centre [m], from Revolve's own SDF.
-LEG = {
-    "frame": 0.0555,
-    "first axis": 0.06015,
-    "servo": 0.071025,
-    "plate": 0.082775,
-    "brick": 0.102275,
-    "second frame": 0.132275,
-    "second axis": 0.136925,
-    "second brick": 0.17905,
-}
-SIDES = {"back": (0, -1, 0), "front": (0, 1, 0), "right": (1, 0, 0), "left": (-1, 0, 0)}
 
 
 def forward(robot):
@@ -40,48 +29,12 @@ def forward(robot):
     return data
 
 
-def test_spider_has_nine_bodies_fourteen_degrees_of_freedom(spider):
-    model = spider.mj_model
-    assert model.nbody - 1 == 9
-    assert (model.nv, model.nq, model.nu, model.njnt) == (14, 15, 8, 9)
-    assert spider.num_hinges == 8
-    assert spider.morphology.num_modules == 17
-    # A core, and a frame and a servo for each hinge, and a brick upon each.
-    assert len(spider.fluid.volume) == 1 + 8 * 2 + 8
-
-
-@pytest.mark.parametrize("side", SIDES)
-def test_spider_geometry_is_revolves(spider, side):
-    """Axes, anchors and modules of each leg to 0.1 mm."""
-    model, data = spider.mj_model, forward(spider)
-    out = np.array(SIDES[side], float)
-    hip, knee = (data.joint(f"{side}_{name}") for name in ("hip", "knee"))
-    for joint, key in ((hip, "first axis"), (knee, "second axis")):
-        assert joint.xanchor == pytest.approx(out * LEG[key], abs=1e-4)
-    # The first axis is vertical, the second horizontal and across the leg.
-    assert np.abs(hip.xaxis) == pytest.approx([0, 0, 1], abs=1e-6)
-    assert np.abs(knee.xaxis) == pytest.approx(np.abs(np.cross(out, [0, 0, 1])), abs=1e-6)
-    places = {
-        "hip/frame": "frame",
-        "hip/servo": "servo",
-        "thigh/brick": "brick",
-        "knee/frame": "second frame",
-        "foot/brick": "second brick",
-    }
-    for name, key in places.items():
-        assert data.geom(f"{side}_{name}").xpos == pytest.approx(out * LEG[key], abs=1e-4)
-    # The plate stands 1 mm off centre, along the hinge's axis.
-    plate = data.geom(f"{side}_hip/servo/1").xpos
-    assert plate @ out == pytest.approx(LEG["plate"], abs=1e-4)
-    assert np.linalg.norm(plate - out * (plate @ out)) == pytest.approx(0.001, abs=1e-4)
-    assert model.body(f"{side}_hip").parentid[0] == model.body("core").id
-
-
 def test_inertia_of_a_link_by_hand(spider):
     """The foot: servo box and brick about their common centre of mass, by Steiner's rule."""
     size = {"servo": (0.0245, 0.02575, 0.015), "brick": (0.041, 0.041, 0.0355)}
     mass = {"servo": 0.009, "brick": 0.0102}
-    along = {"servo": LEG["second axis"] + 0.010875, "brick": LEG["second brick"]}
+    # From the core's centre, by Revolve's own SDF; the servo's is 10.875 mm behind the second axis.
+    along = {"servo": 0.136925 + 0.010875, "brick": 0.17905}
     center = sum(mass[k] * along[k] for k in mass) / 0.0192
     # About the vertical: servo and brick lie flat in the second hinge (turned by -90 and 0).
     expected = 0.0
@@ -90,10 +43,10 @@ def test_inertia_of_a_link_by_hand(spider):
         # In the foot's own frame the hinge's axis is y and the leg runs along x.
         across = {"servo": x * x + z * z, "brick": y * y + z * z}[k]
         expected += mass[k] * (across / 12 + (along[k] - center) ** 2)
-    body_id = spider.mj_model.body("front_knee").id
-    turn = np.zeros(9)
-    mujoco.mju_quat2Mat(turn, spider.mj_model.body_iquat[body_id])
-    axes = turn.reshape(3, 3)
+    hip, knee = (spider.mj_model.body(f"front_{name}") for name in ("hip", "knee"))
+    assert (hip.parentid[0], knee.parentid[0]) == (spider.mj_model.body("core").id, hip.id)
+    body_id = knee.id
+    axes = rotation(spider.mj_model.body_iquat[body_id])
     inertia = axes @ np.diag(spider.mj_model.body_inertia[body_id]) @ axes.T
     axis = spider.mj_model.jnt_axis[spider.mj_model.body_jntadr[body_id]]
     assert axis @ inertia @ axis == pytest.approx(expected, rel=1e-6)
@@ -130,7 +83,16 @@ def test_every_morphology_builds(path):
     assert model.body_subtreemass[0] == pytest.approx(morphology.mass)
     assert fluid.mass.sum() == pytest.approx(morphology.mass)
     assert fluid.volume.sum() == pytest.approx(morphology.volume)
-    # Every part's box lies where the morphology has it at rest.
+    # Axes, anchors and boxes lie where the morphology has them at rest.
+    for module in morphology.modules:
+        if (hinge := module.kind.hinge) is not None:
+            joint, place = data.joint(module.name), module.position + module.rotation @ hinge.anchor
+            assert joint.xanchor == pytest.approx(place, abs=1e-9)
+            assert joint.xaxis == pytest.approx(module.rotation @ hinge.axis, abs=1e-9)
+        named = [(part.name, k) for part in module.kind.parts for k in range(len(part.boxes))]
+        for (name, k), (center, _) in zip(named, module.boxes(), strict=True):
+            geom = data.geom(f"{module.name}/{name}" + (f"/{k}" if k else ""))
+            assert geom.xpos == pytest.approx(center, abs=1e-9)
     turn = data.xmat[fluid.body].reshape(-1, 3, 3)
     place = data.xpos[fluid.body] + np.einsum("nij,nj->ni", turn, fluid.position)
     k = 0

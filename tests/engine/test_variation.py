@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import QUICK, WATER, body, box_robot, random_states, with_motors, world
-from mjx_revolve.body.morphology import load_morphology
+from laboratory import QUICK, WATER, body, box_robot, oar_robot, random_states, with_motors, world
 from mjx_revolve.engine.population import acceleration, tree_plant
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.single_tree import make_single_tree
@@ -14,12 +13,6 @@ from mjx_revolve.engine.variation import Variation
 from mjx_revolve.water.flow import water_of
 
 BOX = (0.2, 0.1, 0.06)
-# Inertia on both sides of one hinge.
-ARM = """
-id: arm
-body: {id: core, type: Core, children: {1: {id: hinge, type: ActiveHinge, children: {
-  1: {id: blade, type: FixedBrick}}}}}
-"""
 CUBE = {"mass": 1.0, "center_of_volume": (0.01, 0.0, 0.0)}
 
 
@@ -64,10 +57,8 @@ def test_a_factor_is_worth_a_coefficient(factors, part, fields, drag):
 
 
 @pytest.mark.slow
-def test_a_faster_motor_and_one_lane_each(tmp_path):
-    (tmp_path / "arm.yaml").write_text(ARM)
-    core = load_morphology(tmp_path / "arm.yaml")
-    arm = build_robot(core, world(**WATER))
+def test_a_faster_motor_and_one_lane_each():
+    arm = oar_robot(world(**WATER))
     qpos, qvel = random_states(arm, 2, speed=0.3)
     qvel[6:] = 4.6  # between the knee and the top speed
     ctrl = np.full((arm.mj_model.nu, 2), 1.0)

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import swimmer
+from laboratory import make_track, swimmer
 from mjx_revolve import InputError, make_fitness
 from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.scoring import WORST
-from mjx_revolve.episodes.tasks import TASKS, Track, find_task, score_unit, shown_measure
+from mjx_revolve.episodes.tasks import TASKS, find_task, score_unit, shown_measure
 
 KEY = jax.random.key(7)
 # The smallest robot with joints: compiles fast.
@@ -85,20 +85,12 @@ def test_a_crawler_needs_a_bed(settings):
         make_fitness(settings, **{"task.type": "crawl", "world": {"name": "lake", "bed": False}})
 
 
-def track(x, z=None, clearance=1.0, start=0.0, drift=0.0):
+def track(x, z=None, clearance=1.0, drift=0.0):
     """One individual that moves along x in steps of 1 s, in water that does, too [m/s]."""
-    x = np.asarray(x, np.float32)
-    z = np.zeros_like(x) if z is None else np.asarray(z, np.float32)
-    return Track(
-        position=jnp.asarray(np.stack([x, 0 * x, z], 1)[:, :, None]),
-        clearance=jnp.full((len(x), 1), clearance),
-        energy=jnp.ones((len(x), 1)),
-        interval=1.0,
-        start_height=jnp.full(1, start),
-        length=0.5,
-        weight=2.0,
-        surface_height=3.0,
-        water_velocity=jnp.full((len(x), 3, 1), 0.0).at[:, 0].set(drift),
+    rows, z = np.ones(len(x)), np.zeros(len(x)) if z is None else z
+    water = np.outer(rows, [drift, 0, 0])
+    return make_track(
+        np.stack([x, 0 * rows, z], 1), clearance=clearance * rows, water_velocity=water
     )
 
 

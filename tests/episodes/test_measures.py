@@ -3,40 +3,24 @@
 import json
 import math
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import ROOT, body
+from laboratory import ROOT, body, make_track
 from mjx_revolve import InputError, make_fitness, make_mixed_fitness
 from mjx_revolve.episodes.config import load_config, make_config
 from mjx_revolve.episodes.measure_table import MEASURES, records_of
 from mjx_revolve.episodes.measures import measure
-from mjx_revolve.episodes.tasks import RECORDS, Track
+from mjx_revolve.episodes.tasks import RECORDS
 
 ALWAYS = {name for name, entry in MEASURES.items() if not entry.record}
 GAIT = ["gait_frequency_hz", "gait_phase_spread_rad", "gait_phase_lag_rad", "joint_amplitude_rad"]
 TIME = 0.1 * np.arange(90)  # of most tracks here [s]
-
-
-def track(position, interval=0.1, **more):
-    """`position` `[S, 3]`, one lane; what `more` holds is `[S, n]`, and gets its lane, too."""
-    wide = lambda x: jnp.asarray(np.asarray(x, np.float32)[..., None])  # noqa: E731
-    rows = len(position)
-    return Track(
-        position=wide(position),
-        clearance=jnp.ones((rows, 1)),
-        energy=jnp.ones((rows, 1)),
-        interval=interval,
-        start_height=jnp.zeros(1),
-        length=0.5,
-        weight=2.0,
-        surface_height=3.0,
-        num_hinges=more["angle"].shape[1] if "angle" in more else 0,
-        **{name: wide(x) for name, x in more.items()},
-    )
+track = partial(make_track, interval=0.1)
 
 
 def still(**more):

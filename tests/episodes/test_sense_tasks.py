@@ -1,30 +1,15 @@
 """Tasks that need senses: scores of known tracks, and the same pursuer wherever it swims."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from laboratory import make_track as track
 from mjx_revolve import make_fitness
 from mjx_revolve.episodes.config import TaskConfig
-from mjx_revolve.episodes.tasks import TASKS, Track
-
-ROOT = Path(__file__).resolve().parents[2]
-
-
-def track(position, **more):
-    """One individual, half a metre long, a row in each second; position `[S, 3]` [m]."""
-    position = np.asarray(position, np.float32)
-    rows = len(position)
-    lanes = {name: jnp.asarray(np.asarray(x, np.float32)[..., None]) for name, x in more.items()}
-    return Track(
-        position=jnp.asarray(position[..., None]), clearance=jnp.full((rows, 1), jnp.inf),
-        energy=jnp.zeros((rows, 1)), interval=1.0, start_height=jnp.zeros(1), length=0.5,
-        weight=1.0, surface_height=0.0, **lanes,
-    )  # fmt: skip
+from mjx_revolve.episodes.tasks import TASKS
 
 
 def along_x(*x, z=0.0):

@@ -6,13 +6,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import _ELBOW, body, read
+from laboratory import _ELBOW, body, make_track, read
 from mjx_revolve import InputError, make_fitness, make_mixed_fitness
 from mjx_revolve.body.edits import add_module
 from mjx_revolve.engine.plant import body_geometry
 from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.starts import draw_starts, episode_context, start_pose, target_path
-from mjx_revolve.episodes.tasks import RECORDS, TASKS, Task, Track
+from mjx_revolve.episodes.tasks import RECORDS, TASKS, Task
 from mjx_revolve.water.world import load_world
 
 KEY, G, RHO = jax.random.key(0), 9.81, 999.1026
@@ -208,12 +208,8 @@ def test_a_target_that_flees_must_be_followed():
     """From 4 m away to 1 m, while the target goes 1 m further."""
     row = np.array([0.0, 1.0, 4.0])
     zero = np.zeros_like(row)
-    track = Track(
-        position=jnp.asarray(np.stack([row, zero, zero], 1)[..., None]),
-        clearance=jnp.inf, energy=jnp.zeros((3, 1)), interval=0.1, start_height=jnp.zeros(1),
-        length=0.5, weight=1.0, surface_height=0.0,
-        target=jnp.asarray(np.stack([4 + row / 4, zero, zero], 1)[..., None]),
-    )  # fmt: skip
+    target = np.stack([4 + row / 4, zero, zero], 1)
+    track = make_track(np.stack([row, zero, zero], 1), interval=0.1, target=target)
     found = TASKS["reach_target"].score(track, TaskConfig(type="reach_target", target_distance=4.0))
     assert found == pytest.approx((4 - 1) / 0.5)
 

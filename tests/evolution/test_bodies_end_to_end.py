@@ -30,9 +30,8 @@ CONFIG = {
 
 
 @pytest.mark.slow
-def test_the_smallest_run(tmp_path, monkeypatch, capsys, quick_compiles):
+def test_the_smallest_run(tmp_path, monkeypatch, capsys, no_pictures, quick_compiles):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("mjx_revolve.view.results.save_pictures", lambda run, champion: None)
     (tmp_path / "small.yaml").write_text(json.dumps(CONFIG))
     argv = ["small.yaml", "--out", "run", "--workers", "1"]
     assert run_command(command.main, argv) == 0

@@ -8,26 +8,23 @@ import shutil
 import subprocess
 import sys
 
-import jax
-import numpy as np
 import pytest
 
 import toys
-from laboratory import ROOT, XLA_FLAGS
+from laboratory import ROOT, XLA_FLAGS, check_refused
 from mjx_revolve import sweep
 from mjx_revolve.episodes.config import load_config
 from mjx_revolve.evolution import jobs
 from mjx_revolve.evolution import run_folder as runs
-from mjx_revolve.evolution.executor import Executor, make_executor
+from mjx_revolve.evolution.executor import make_executor
 from mjx_revolve.evolution.jobs import Limits
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
-from toys import CLOCK, wait_for
+from toys import CLOCK, check_scores, wait_for
 
 distributed = pytest.importorskip("distributed", reason="the extra [cluster] is not installed")
 dask = pytest.importorskip("dask")
 pytestmark = pytest.mark.slow
-KEY = jax.random.key(1)
 
 
 class Dask:
@@ -45,7 +42,7 @@ class Dask:
     def start(self, program, *argv, package=ROOT):
         path = f"{package}{os.pathsep}{ROOT / 'tests'}"
         environment = os.environ | {"PYTHONPATH": path, "TOY_TROUBLE": str(self.folder / "order")}
-        environment |= XLA_FLAGS | {"JAX_COMPILATION_CACHE_DIR": ""}
+        environment |= XLA_FLAGS
         module = f"distributed.cli.{program}"
         process = subprocess.Popen(
             [sys.executable, "-m", module, "--scheduler-file", str(self.file), *argv],
@@ -92,15 +89,6 @@ def executor(cluster, config):
             yield executor
 
 
-def check_scores(executor, seed, size=22):
-    """The same bits as in this process."""
-    population = np.random.default_rng(seed).normal(size=(size, 5)).astype(np.float32)
-    scores, measures = executor.evaluate(population, KEY)
-    alone, alone_measures = Executor(toys.Toy(), 4).evaluate(population, KEY)
-    assert scores.tobytes() == alone.tobytes()
-    assert measures["distance_m"].tobytes() == alone_measures["distance_m"].tobytes()
-
-
 def said(caplog):
     return [r.getMessage() for r in caplog.records if r.name.startswith("mjx_revolve")]
 
@@ -115,9 +103,9 @@ def test_workers_may_join_at_any_time(cluster, executor, caplog):
     assert [line for line in said(caplog) if "waiting" not in line] == []
 
 
-def test_a_sweep_has_the_workers_of_a_cluster(cluster, executor, tmp_path, monkeypatch, capsys):
+@pytest.mark.usefixtures("executor", "no_pictures")
+def test_a_sweep_has_the_workers_of_a_cluster(cluster, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("mjx_revolve.view.results.save_pictures", lambda start, champion: None)
     toys.write_config(tmp_path / "toy.yaml", population_size=8, generations=3)
     for options in (["--out", "here"], ["--out", "there", "--cluster", str(cluster.file)]):
         argv = ["toy.yaml", "--seeds", "2", *options]
@@ -178,9 +166,7 @@ def test_workers_of_another_source_are_refused(cluster, executor, config, caplog
     ],
 )
 def test_places_without_a_scheduler_are_one_line(config, place, message):
-    with pytest.raises(InputError, match=message) as caught:
-        make_executor(config, None, toys.make_toy, place)
-    assert "\n" not in str(caught.value)
+    check_refused(message, make_executor, config, None, toys.make_toy, place)
 
 
 def test_without_dask_it_says_what_to_install(config, monkeypatch):

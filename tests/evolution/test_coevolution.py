@@ -30,16 +30,9 @@ from toys import CLOCK, make_toy_bodies
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
     monkeypatch.chdir(tmp_path)
     toys.write_bodies_config(tmp_path / "toy.yaml")
     return tmp_path
-
-
-@pytest.fixture
-def no_pictures(monkeypatch):
-    """Runs end without their plots, which take a second each."""
-    monkeypatch.setattr("mjx_revolve.view.results.save_pictures", lambda start, champion: None)
 
 
 def start(folder, bodies=(), **evolution):

@@ -29,24 +29,23 @@ from mjx_revolve.evolution.jobs import Limits, WorkerError, make_job, open_job
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.numerics import runtime
 from mjx_revolve.water.world import load_world
-from toys import contents, wait_for
+from toys import check_scores, contents, wait_for
 
 KEY = jax.random.key(1)
 needs_proc = pytest.mark.skipif(not Path("/proc").is_dir(), reason="lists processes by /proc")
 
 
-@pytest.fixture(autouse=True)
-def own_settings(monkeypatch):
-    """Workers compile as this process does, and nothing goes into the user's cache."""
-    for name, value in XLA_FLAGS.items():
-        monkeypatch.setenv(name, value)
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+@pytest.fixture(scope="module", autouse=True)
+def same_flags():
+    """Workers compile as this process does."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XLA_FLAGS", XLA_FLAGS["XLA_FLAGS"])
+        yield
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """A folder with a config, current; runs end without their plots, which take a second each."""
-    monkeypatch.setattr("mjx_revolve.view.results.save_pictures", lambda start, champion: None)
+def folder(tmp_path, monkeypatch, no_pictures):
+    """A folder with a config, current."""
     monkeypatch.chdir(tmp_path)
     toys.write_config(tmp_path / "toy.yaml", population_size=10, checkpoint_every=4)
     return tmp_path
@@ -110,27 +109,15 @@ def test_without_workers_or_blocks_a_pool_is_its_fitness():
 @pytest.fixture(scope="module")
 def crowd(tmp_path_factory):
     """Three workers."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in XLA_FLAGS.items():
-            patch.setenv(name, value)
-        patch.setenv("JAX_COMPILATION_CACHE_DIR", "")
-        config = toy_config(tmp_path_factory.mktemp("crowd"), population_size=10, generations=6)
-        with make_executor(config, 3, toys.make_toy) as executor:
-            yield config, executor
+    config = toy_config(tmp_path_factory.mktemp("crowd"), population_size=10, generations=6)
+    with make_executor(config, 3, toys.make_toy) as executor:
+        yield config, executor
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 5, 33])
 def test_scores_do_not_depend_on_the_workers(crowd, size):
-    _, executor = crowd
-    population = np.random.default_rng(size).normal(size=(size, 5)).astype(np.float32)
-    key = jax.random.key(size)
-    scores, measures = executor.evaluate(population, key)
-    alone, alone_measures = Executor(toys.Toy(), 4).evaluate(population, key)
-    assert scores.dtype == np.float32 and scores.shape == (size,)
-    assert scores.tobytes() == alone.tobytes()
-    assert measures.keys() == alone_measures.keys() == {"distance_m"}
-    assert measures["distance_m"].tobytes() == alone_measures["distance_m"].tobytes()
+    check_scores(crowd[1], size, size)
 
 
 def test_the_champion_does_not_depend_on_blocks(crowd):
@@ -229,9 +216,6 @@ def troubled(tmp_path_factory):
     """Two workers, and a file that says what happens to one of them."""
     folder = tmp_path_factory.mktemp("troubled")
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in XLA_FLAGS.items():
-            patch.setenv(name, value)
-        patch.setenv("JAX_COMPILATION_CACHE_DIR", "")
         patch.setenv("TOY_TROUBLE", str(folder / "order"))
         patch.setattr(jobs, "LIMITS", Limits(block=15.0, tries=2))
         with make_executor(toy_config(folder), 2, toys.make_troubled) as executor:
@@ -254,11 +238,7 @@ def test_a_lost_worker_is_replaced_and_costs_nothing(troubled, kind, how, caplog
     executor, order = troubled
     before = pids_of(executor)
     order.write_text(kind)
-    population = np.random.default_rng(3).normal(size=(22, 5)).astype(np.float32)
-    scores, measures = executor.evaluate(population, KEY)
-    alone, alone_measures = Executor(toys.Toy(), 4).evaluate(population, KEY)
-    assert scores.tobytes() == alone.tobytes()
-    assert measures["distance_m"].tobytes() == alone_measures["distance_m"].tobytes()
+    check_scores(executor, 3)
     hit = int(next(order.parent.glob("order.*")).suffix[1:])
     order.with_suffix(f".{hit}").unlink()
     assert hit in before and is_alive(hit) == (kind == "raise")
@@ -409,9 +389,7 @@ def test_workers_do_not_outlive_their_leader(folder):
 
 
 @pytest.mark.slow
-def test_a_robot_does_not_depend_on_its_workers(tmp_path, monkeypatch):
-    (tmp_path / "cache").mkdir()
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
+def test_a_robot_does_not_depend_on_its_workers(tmp_path):
     path = toys.write_config(tmp_path / "knee.yaml", population_size=10)
     (tmp_path / "robot.yaml").write_text(OAR)
     config = load_config(path, ["task.trials=16", "task.duration=0.2", "task.settle=0.05"])

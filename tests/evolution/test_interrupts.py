@@ -95,7 +95,7 @@ def start(folder, stuck=0):
     return subprocess.Popen(
         [sys.executable, "script.py", "toy.yaml", "--out", "run"], cwd=folder,
         text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=os.environ | XLA_FLAGS | {
-            "PYTHONPATH": PATH, "STUCK": str(stuck), "JAX_COMPILATION_CACHE_DIR": "",
+            "PYTHONPATH": PATH, "STUCK": str(stuck),
         },
     )  # fmt: skip
 

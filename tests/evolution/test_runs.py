@@ -17,7 +17,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from mjx_revolve.body.catalogue import load_modules
 from mjx_revolve.episodes.champion import load_genes
-from mjx_revolve.episodes.config import load_config, make_config, override_config
+from mjx_revolve.episodes.config import OLDER_WORLD, load_config, make_config, override_config
 from mjx_revolve.episodes.fitness import make_fitness
 from mjx_revolve.evolution import run_folder as runs
 from mjx_revolve.evolution.fingerprints import settings_hash
@@ -124,43 +124,49 @@ def test_older_run_folders_open(tmp_path, config):
     assert load_world(run.load_config().world_name).density == 1030.0
 
 
-def test_older_runs_keep_the_core_and_the_length_at_rest(tmp_path, config):
-    older = override_config(config, {"task.point": "core", "task.length": "rest"})
+def test_older_runs_keep_the_values_of_their_time(tmp_path, config):
+    changes = {"task.point": "core", "task.length": "rest"}
+    older = override_config(
+        config, changes | {"controller.rate": None, "controller.between": "hold"}
+    )
     run, _ = runs.create_run_folder(tmp_path / "run", older)
     text = (run.path / "config.yaml").read_text()
-    for line in ("point: core", "length: rest", "horizon: null"):
+    for line in ("point: core", "length: rest", "horizon: null", "rate: null", "between: hold"):
         assert f"\n  {line}\n" in text
         text = text.replace(f"  {line}\n", "")
     (run.path / "config.yaml").write_text(text)
     run.close()
     found = run.load_config()
     assert (found.task.point, found.task.length) == ("core", "rest")
+    assert (found.controller.rate, found.controller.between) == (None, "hold")
     assert settings_hash(found) == settings_hash(older) != settings_hash(config)
+    assert settings_hash(older) != settings_hash(override_config(older, {"controller.rate": 20.0}))
     assert config.task.point == "center_of_mass"  # a user's file without them is a new one
 
 
 def test_older_runs_keep_the_drag_of_faces(tmp_path, config):
     pond = tmp_path / "pond.yaml"
     pond.write_text("drag: ellipsoid\n")
-    for name, change, stated, law in (
-        ("new", {}, "cross_flow", "cross_flow"),
-        ("older", {"world.drag": "faces"}, None, "faces"),
-        ("own", {"world": str(pond)}, None, "ellipsoid"),
+    for name, change, left_out, stated, law in (
+        ("new", {}, (), "cross_flow", "cross_flow"),
+        ("older", {"world.drag": "faces"}, ("drag",), None, "faces"),
+        ("oldest", {"world": {"name": "lake"} | OLDER_WORLD}, tuple(OLDER_WORLD), None, "faces"),
+        ("own", {"world": str(pond)}, (), None, "ellipsoid"),
     ):
         made = override_config(config, change)
         run, _ = runs.create_run_folder(tmp_path / name, made)
         began = settings_hash(made)
         text = yaml.safe_load((run.path / "config.yaml").read_text())
-        if name == "older":  # as it was written then
-            assert text["world"].pop("drag") == "faces"
+        for field in left_out:  # as it was written then
+            assert text["world"].pop(field) == OLDER_WORLD[field]
             began = settings_hash(config)
-        elif stated:
+        if stated:
             assert text["world"]["drag"] == stated
         (run.path / "config.yaml").write_text(yaml.safe_dump(text))
         run.close()
         found = run.load_config()
         assert load_world(found.world_name, **found.world_overrides).drag == law
-        assert began == settings_hash(found, older_world=("drag",) if name == "older" else ())
+        assert began == settings_hash(found, older_world=left_out)
 
 
 def test_a_robot_that_nothing_moves_does_not_evolve():

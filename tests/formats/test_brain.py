@@ -15,7 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from exports import ODD
-from laboratory import compiled_quickly, read
+from laboratory import read
 from mjx_revolve.control.controller import Controller
 from mjx_revolve.control.readings import readings_at_rest
 from mjx_revolve.control.sensors import count_samples
@@ -203,10 +203,7 @@ def clipped(brain, ctrl):
     return np.clip(ctrl, brain.low, brain.high)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick():
-    with compiled_quickly():
-        yield
+pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 
 KINDS = [*CONTROLLERS, "mine.py:matrix"]

@@ -6,6 +6,7 @@ import pytest
 import trimesh
 
 from exports import lake_robot
+from laboratory import write
 from mjx_revolve import build_robot, load_modules, load_morphology, load_world
 from mjx_revolve.formats import import_robot, make_links, make_meshes, make_mjcf, make_urdf
 from mjx_revolve.formats.rigid_links import box_around, closed_volume
@@ -75,12 +76,6 @@ MJCF = """
 """
 
 
-def write(folder, text, name="robot.urdf"):
-    path = folder / name
-    path.write_text(text, encoding="utf-8")
-    return path
-
-
 def mass_matrices(model, seed=0):
     """Mass matrices at three random angles of the hinges, without the motors' own inertia."""
     data, draw, found = mujoco.MjData(model), np.random.default_rng(seed), []
@@ -133,7 +128,7 @@ def test_what_is_exported_comes_back(name, kind, tmp_path):
 
 
 def test_a_urdf_of_boxes_and_cylinders(tmp_path):
-    path = write(tmp_path, URDF)
+    path = write(tmp_path, URDF, "robot.urdf")
     found = import_robot(path)
     model = built(found).mj_model
     # MuJoCo has no free base and no rod on its slide: both are given to it.
@@ -219,7 +214,7 @@ def test_shapes_have_their_volumes():
 
 def test_the_command_writes_what_other_commands_read(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    path = write(tmp_path, URDF)
+    path = write(tmp_path, URDF, "robot.urdf")
     assert main([str(path), "--out", "robots"]) == 0
     said = capsys.readouterr().out
     assert "slide: a prismatic joint" in said and "robots/two_legs.yaml" in said
@@ -244,7 +239,7 @@ def test_the_command_writes_what_other_commands_read(tmp_path, capsys, monkeypat
 )  # fmt: skip
 def test_what_is_wrong_is_said_in_a_line(old, new, expected, tmp_path):
     assert old in URDF
-    path = write(tmp_path, URDF.replace(old, new, 1))
+    path = write(tmp_path, URDF.replace(old, new, 1), "robot.urdf")
     with pytest.raises(InputError) as error:
         import_robot(path)
     assert str(error.value).startswith(f"{path}: {expected}")
@@ -252,7 +247,7 @@ def test_what_is_wrong_is_said_in_a_line(old, new, expected, tmp_path):
 
 def test_meshes_that_are_missing_or_open_are_named(tmp_path):
     text = URDF.replace('<sphere radius="0.03"/>', '<mesh filename="package://x/ball.stl"/>')
-    found = import_robot(write(tmp_path, text))
+    found = import_robot(write(tmp_path, text, "robot.urdf"))
     assert found.missing[0] == "base: the mesh package://x/ball.stl, which cannot be read"
     ball = trimesh.creation.icosphere(radius=0.03)
     ball.export(tmp_path / "ball.stl")

@@ -306,7 +306,6 @@ def whole(tmp_path_factory):
     path = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(path)
-        patch.setenv("JAX_COMPILATION_CACHE_DIR", "")
         (path / "elbow.yaml").write_text(_ELBOW)
         config = {
             "morphology": "elbow.yaml", "world": "lake", "task": {"type": "speed"},

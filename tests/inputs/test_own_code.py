@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from laboratory import _ELBOW as ELBOW
+from laboratory import check_refused
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.episodes.config import load_config
 from mjx_revolve.episodes.fitness import make_fitness
@@ -16,7 +17,6 @@ from mjx_revolve.evolution import run_folder as runs
 from mjx_revolve.evolution.fingerprints import settings_hash
 from mjx_revolve.evolution.run import check_unchanged
 from mjx_revolve.inputs import user_code as own_code
-from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.report.data import read_run
 
 OWN = '''
@@ -122,13 +122,6 @@ def test_a_changed_file_is_read_anew_and_an_unchanged_one_is_not(folder):
     assert own_code.load_user_function(name, "task.type") is not first
 
 
-def check_line(message, action):
-    with pytest.raises(InputError) as caught:
-        action()
-    assert "\n" not in str(caught.value)
-    assert message in str(caught.value), str(caught.value)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -144,7 +137,7 @@ def test_wrong_tasks(folder, text, message):
     own = folder / "mine" / "task.py"
     own.write_text(text)
     settings = {"task.type": "mine/task.py:rise"}
-    check_line(message.format(own=own), lambda: make_fitness("swim.yaml", **settings))
+    check_refused(message.format(own=own), lambda: make_fitness("swim.yaml", **settings))
 
 
 @pytest.mark.parametrize(
@@ -160,7 +153,7 @@ def test_wrong_controllers(folder, old, new, message):
     own = folder / "mine" / "own.py"
     assert old in OWN
     own.write_text(OWN.replace(old, new))
-    check_line(message.format(own=own), lambda: make_fitness("swim.yaml"))
+    check_refused(message.format(own=own), lambda: make_fitness("swim.yaml"))
 
 
 def test_a_run_keeps_the_code(folder):
@@ -192,7 +185,7 @@ def test_only_the_same_code_goes_on_with_a_run(folder):
     run.close()
     check_unchanged(kept, config, "--resume run")
     (folder / "mine" / "own.py").write_text(OWN + "\n")
-    check_line(
+    check_refused(
         "--resume run: controller.type: expected '",
         lambda: check_unchanged(kept, config, "--resume run"),
     )

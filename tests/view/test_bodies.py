@@ -80,7 +80,6 @@ def make_run(folder, bodies=(), born=BORN, living=LIVING):
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
     return make_run(tmp_path / "run")
 
 

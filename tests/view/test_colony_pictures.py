@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import yaml
 
-from laboratory import QUICK
 from mjx_revolve import report, viewer
 from mjx_revolve.episodes.individual_log import Event, read_events
 from mjx_revolve.evolution.colony_observer import open_colony
@@ -107,14 +106,12 @@ SETTINGS = {
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def run(tmp_path_factory, quick_compiles):
     """A colony of eight places, from the command."""
     folder = tmp_path_factory.mktemp("colony")
     (folder / "colony.yaml").write_text(yaml.safe_dump(SETTINGS))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
-        assert main([str(folder / "colony.yaml"), "--out", str(folder / "run")]) == 0
-        yield folder / "run"
+    assert main([str(folder / "colony.yaml"), "--out", str(folder / "run")]) == 0
+    return folder / "run"
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.view.forces import module_forces
 from mjx_revolve.water.flow import Water, flow, water_of
 from mjx_revolve.water.plates import LiftDrag
+from references import rotation
 
 RHO, G = 999.1026, 9.81
 BRICK = (0.06, 0.04, 0.02)
@@ -83,9 +84,7 @@ def test_thrust_follows_the_curve():
     robot = box_robot((0.1, 0.1, 0.1), 1.0, world(buoyancy="partial"), thruster=thruster)
     rows, lagged = [pose(), pose(quat=TURNED), pose(z=1.0)], np.array([[0.5], [-0.7], [1.0]])
     forces = module_forces(robot, states(robot, rows, ctrl=np.ones((3, 1)), command=lagged))
-    turn = np.zeros(9)
-    mujoco.mju_quat2Mat(turn, np.array(TURNED))
-    expected = [[0, 0.8 * 0.25, 0], -0.8 * 0.49 * turn.reshape(3, 3)[:, 1], [0, 0, 0]]
+    expected = [[0, 0.8 * 0.25, 0], -0.8 * 0.49 * rotation(TURNED)[:, 1], [0, 0, 0]]
     assert forces.thrust[:, 0] == pytest.approx(np.array(expected), abs=1e-6)
     # Without a record of the lag, what was asked for.
     asked = module_forces(robot, states(robot, rows, ctrl=np.full((3, 1), 0.5)))

@@ -291,7 +291,6 @@ def catalogue():
 
 
 def test_ctrl_c_ends_it(monkeypatch, capsys):
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
     # Tests in the background ignore it.
     heard = signal.signal(signal.SIGINT, signal.default_int_handler)
     made = []
@@ -319,8 +318,7 @@ def test_ctrl_c_ends_it(monkeypatch, capsys):
         (["--robots", "0"], "--robots: expected a whole number from 1 to 64; found '0'"),
     ],
 )
-def test_mistakes_end_in_one_line(monkeypatch, capsys, argv, said):
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
+def test_mistakes_end_in_one_line(capsys, argv, said):
     assert run_command(live.main, argv) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"error: {said}") and error.count("\n") == 1

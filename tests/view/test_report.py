@@ -97,7 +97,6 @@ def copy(lab, tmp_path, monkeypatch):
     """A run of one's own to damage, current folder beside it."""
     shutil.copytree(lab["folder"] / "s0", tmp_path / "run")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
     return tmp_path / "run"
 
 
@@ -106,7 +105,6 @@ def quick(lab, monkeypatch):
     """Reports that compile nothing: all runs have the same robot."""
     monkeypatch.setattr("mjx_revolve.view.report.page.make_fitness", lambda config: lab["fitness"])
     monkeypatch.setattr("mjx_revolve.view.swim_picture.show_scene", lambda *_: None)
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "")
 
 
 def run_main(*argv):

@@ -28,6 +28,7 @@ from mjx_revolve.view.viewer import write_colony_page, write_viewer
 from mjx_revolve.viewer import main
 from mjx_revolve.water.flow import Water, surface, water_of
 from mjx_revolve.water.world import load_world
+from references import rotation
 
 PAGE = ROOT / "mjx_revolve" / "view" / "viewer_page"
 DT = 0.005
@@ -96,15 +97,6 @@ def swim(robot, name, begin, until, place=(0.0, 0.0), rate=20.0, **more):
     qpos[:, 2], qpos[:, 3] = -1.0, 1.0
     qpos[:, 7:] = 0.5 * np.sin(2 * np.pi * time[:, None] + np.arange(robot.num_hinges))
     return ReplayRobot(name, robot, time, qpos, **more)
-
-
-def rotation(q):
-    w, x, y, z = q
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
 
 
 def bend(tree, qpos):

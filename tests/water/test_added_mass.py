@@ -7,7 +7,7 @@ import pytest
 from laboratory import accelerate, arm_robot, at_rest, body, box_robot, march, random_states, world
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.water.added_mass import box_added_mass, lamb_coefficients
-from references import Lagrangian
+from references import Lagrangian, rotation
 
 RHO = 999.1026
 SIZE = (0.12, 0.08, 0.03)  # its carried water weighs from 0.2 to 1.6 times what it displaces
@@ -61,14 +61,10 @@ def impulses(robot, qpos, qvel):
     """Linear and angular (about the world's origin) impulse of a single box and its water."""
     added, spin_added = RHO * robot.fluid.added_mass[0], RHO * robot.fluid.added_inertia[0]
     mass, own = robot.mj_model.body_mass[1], robot.mj_model.body_inertia[1]
-    turn = np.zeros(9)
-    mujoco.mju_quat2Mat(turn, qpos[3:7] / np.linalg.norm(qpos[3:7]))
-    turn = turn.reshape(3, 3)
+    turn = rotation(qpos[3:7] / np.linalg.norm(qpos[3:7]))
     linear = turn @ ((mass + added) * (turn.T @ qvel[:3]))
     # MuJoCo keeps principal inertias in an order of its own.
-    axes = np.zeros(9)
-    mujoco.mju_quat2Mat(axes, robot.mj_model.body_iquat[1])
-    axes = axes.reshape(3, 3)
+    axes = rotation(robot.mj_model.body_iquat[1])
     inertia = axes @ np.diag(own) @ axes.T + np.diag(spin_added)
     return np.concatenate([linear, np.cross(qpos[:3], linear) + turn @ inertia @ qvel[3:6]])
 

@@ -13,6 +13,7 @@ from mjx_revolve.water.near_surface import near_surface, turning_share
 RHO, G = 999.1026, 9.81
 LONG, BREADTH, HEIGHT = 2.0, 0.4, 0.25
 MASS = (3.0, 40.0, 90.0)
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def close(up, depth, size=(LONG, BREADTH, HEIGHT), entrained=0.0, gravity=G):
@@ -22,12 +23,6 @@ def close(up, depth, size=(LONG, BREADTH, HEIGHT), entrained=0.0, gravity=G):
     carried = CarriedWater(None, MASS, MASS, (entrained,) * 3)  # type: ignore[arg-type]
     submerged, _ = BUOYANCY_LAWS["partial"].submersion(up, jnp.asarray(depth), half)
     return near_surface(up, jnp.asarray(depth), submerged, half, carried, gravity)
-
-
-@pytest.fixture(autouse=True)
-def double():
-    with jax.enable_x64(True):
-        yield
 
 
 def test_an_upright_section_has_strip_theorys_values():

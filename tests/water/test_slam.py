@@ -10,21 +10,11 @@ import pytest
 from laboratory import QUICK, at_rest, box_robot, march, random_states, world
 from mjx_revolve.water.buoyancy import BUOYANCY_LAWS
 from mjx_revolve.water.flow import Water
+from references import rotation
 
 RHO = 999.1026
 G = 9.81
 SIZE = np.array([0.2, 0.1, 0.06])
-
-
-def axes(qpos):
-    """`[..., 3, 3]` world from body, of `[..., nq]`."""
-    w, x, y, z = np.moveaxis(qpos[..., 3:7], -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
 @lru_cache
@@ -37,7 +27,7 @@ def _cut(half, mode):
 def wetness(qpos, mode="partial"):
     """Submerged share of the box `SIZE` in `[..., nq]`, and its moment."""
     with jax.enable_x64(True):
-        up = tuple(jnp.asarray(x) for x in np.moveaxis(axes(qpos)[..., 2, :], -1, 0))
+        up = tuple(jnp.asarray(x) for x in np.moveaxis(rotation(qpos[..., 3:7])[..., 2, :], -1, 0))
         share, moment = _cut(tuple(SIZE / 2), mode)(up, jnp.asarray(-qpos[..., 2]))
         return np.asarray(share), np.stack(moment, -1)
 
@@ -63,7 +53,7 @@ def ledger(robot, qpos, qvel, mode="partial"):
     energy is that of weight and of the water raised, ρ g V times the mean over the box of max(0,
     depth); the impulse that of body and water, linear and about the world's origin.
     """
-    mass, turn = robot.mj_model.body_mass[1], axes(qpos)
+    mass, turn = robot.mj_model.body_mass[1], rotation(qpos[..., 3:7])
     own = mass / 12 * (np.sum(SIZE**2) - SIZE**2)
     share, moment = wetness(qpos, mode)
     raised = -share * qpos[..., 2] - np.sum(moment * turn[..., 2, :], -1)
@@ -138,7 +128,7 @@ def test_neither_entry_nor_exit_makes_kinetic_energy(mode):
     mass, added, inertia = 0.3, RHO * robot.fluid.added_mass[0], RHO * robot.fluid.added_inertia[0]
     own = mass / 12 * (np.sum(SIZE**2) - SIZE**2)
     share = wetness(q, mode)[0][:-1, :, None]  # of the states that the velocities below come from
-    seen = np.einsum("...ji,...j->...i", axes(q), v[..., :3])[1:]
+    seen = np.einsum("...ji,...j->...i", rotation(q[..., 3:7]), v[..., :3])[1:]
     spin = v[1:, :, 3:6]
     energy = 0.5 * np.sum((mass + share * added) * seen**2 + (own + share * inertia) * spin**2, -1)
     change = np.diff(energy, axis=0) / energy[:-1]

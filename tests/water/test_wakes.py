@@ -26,6 +26,7 @@ from mjx_revolve.water.plate_wake import PLATE_WAKE, thinness
 
 WATER = world(drag="cross_flow")
 PLATE = (0.004, 0.2, 0.1)  # [m], across x
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def modules(text):
@@ -52,12 +53,6 @@ def fin():
     robot = build_robot(read("body: {type: Core, children: {0: {type: Fin}}}"), WATER)
     assert robot.fluid.drag[1] == "fin_wake"
     return numbers_of(FIN_WAKE, robot, 1)
-
-
-@pytest.fixture(autouse=True)
-def precise():
-    with jax.enable_x64(True):
-        yield
 
 
 def past(law, numbers, velocities, dt):
