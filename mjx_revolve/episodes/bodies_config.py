@@ -126,12 +126,6 @@ class ArchiveConfig(Settings):
             raise ConstraintError(
                 "axes", "at least two descriptors or measures", str(len(self.axes))
             )
-        if self.type == "grid" and self.cells != 256:
-            raise ConstraintError("cells", "256, as those of a grid are the axes'", str(self.cells))
-        for name, axis in self.axes.items():
-            if self.type == "cvt" and axis.cells != 10:
-                what = "10, as those of a cvt archive are its own"
-                raise ConstraintError(f"axes.{name}.cells", what, str(axis.cells))
         cells = math.prod(axis.cells for axis in self.axes.values())
         if self.type == "grid" and cells > _MOST_CELLS:
             raise ConstraintError("axes", f"at most {_MOST_CELLS:,} cells", f"{cells:,}")
