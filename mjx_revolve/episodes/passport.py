@@ -377,11 +377,12 @@ def fresh_starts(whole: Fitness, usual: Fitness, world: World, key: jax.Array) -
     if world.gust is None:
         return starts
     part = round(world.timestep / whole.world.timestep)
-    path = draw_gusts(world, key, whole.num_timesteps // part, whole.settings.trials)
+    steps = whole.num_timesteps
+    path = draw_gusts(world, key, -(-steps // part), whole.settings.trials)
     rest = jnp.arange(part).reshape(-1, 1, 1) / part
     between = path[:-1, None] * (1 - rest) + path[1:, None] * rest
     gusts = jnp.concatenate([between.reshape(-1, *path.shape[1:]), path[-1:]])
-    return starts._replace(gusts=gusts)
+    return starts._replace(gusts=gusts[: steps + 1])
 
 
 def _score(spec: Fitness, chunk: Chunk, track: dict[str, jax.Array]) -> jax.Array:
