@@ -91,12 +91,14 @@ def main(argv: list[str] | None = None) -> int:
     if arguments.resume is None and arguments.robot is None:
         raise InputError("expected a ROBOT and a RECORDING, or --resume DIR; found neither")
     if arguments.resume is not None:
-        options = ("robot", "out", "columns", "plan", "world", "modules", "seed", "settings")
-        found = [name for name in options if getattr(arguments, name)]
-        if found or arguments.free != _FREE:
+        a = arguments
+        given = {"robot": a.robot, "out": a.out, "map": a.columns, "plan": a.plan, "world": a.world,
+                 "modules": a.modules, "seed": a.seed, "set": a.settings,
+                 "free": a.free != _FREE}  # fmt: skip
+        for name in (name for name, value in given.items() if value):
             raise InputError(
                 "--resume: expected --trust alone beside it, as the folder has all else; found "
-                f"{(found or ['free'])[0].replace('columns', 'map').replace('settings', 'set')}"
+                f"{name}"
             )
     if arguments.plan and (arguments.columns or arguments.out or arguments.seed):
         raise InputError("--plan: expected neither --map, --out nor --seed; found one")

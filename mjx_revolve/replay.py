@@ -166,6 +166,7 @@ def main(argv: list[str] | None = None) -> int:
         kinds = (".mp4", ".gif")
         if arguments.html or arguments.ancestors is not None:
             raise InputError("--colony: expected neither --html nor --ancestors; found one")
+    several = arguments.colony or arguments.ancestors is not None
     arguments.size = arguments.size or (_WIDE if arguments.colony else _USUAL)
     name = "colony" if arguments.colony else individual_name(arguments.individual) or "swim"
     if arguments.ancestors is not None:
@@ -173,7 +174,6 @@ def main(argv: list[str] | None = None) -> int:
     paths = None if out is None else _named_paths(out, kinds, name)
     folder = _run_folder(path)
     if paths is None and folder is not None:
-        several = arguments.colony or arguments.ancestors is not None
         kinds = kinds[:1] if several else kinds
         paths = _paths_in(folder, name, kinds)
     check_episode_path(path)
@@ -194,7 +194,7 @@ def main(argv: list[str] | None = None) -> int:
     from mjx_revolve.episodes.champion import load_asked
 
     episode = None
-    if arguments.colony or arguments.ancestors is not None:
+    if several:
         with opening_episode(arguments):
             make = _colony_films if arguments.colony else _ancestor_films
             made = make(arguments, folder)

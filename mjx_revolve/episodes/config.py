@@ -340,10 +340,10 @@ class TaskConfig(Section):
             "a horizon": self.horizon is not None and self.type == "directed_swim",
             f"task.type {self.type}": self.type == "hold_heading",
         }
-        for name in (name for name, needs in level.items() if needs):
-            if math.hypot(*self.direction[:2]) < 1e-9:
-                what = f"one that is not upright, as there is {name}, which is level"
-                raise ConstraintError("direction", what, show(list(self.direction)))
+        upright = math.hypot(*self.direction[:2]) < 1e-9
+        for name in (name for name, needs in level.items() if needs and upright):
+            what = f"one that is not upright, as there is {name}, which is level"
+            raise ConstraintError("direction", what, show(list(self.direction)))
         if math.hypot(*self.direction) < 1e-9:
             raise ConstraintError(
                 "direction", "a vector of some length", show(list(self.direction))

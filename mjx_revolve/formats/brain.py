@@ -187,9 +187,7 @@ def _lower(
         state.append(builder.input(f"state{k}", kind_of(x.dtype), x.size))
     time = builder.input("time", "real", 1)
     signals, leaves = [], {}
-    listed = list(_list_readings(readings))
-    names = unique_names([row[0] for row in listed], set())
-    for name, (_, unit, words, parts) in zip(names, listed, strict=True):
+    for name, unit, words, parts in _list_readings(readings):
         sizes = [int(np.prod(part.shape)) for part in parts]
         number = builder.input(name, "real", sum(sizes))
         signals.append(Signal(name, unit, _comment(words), sum(sizes), number))
@@ -252,16 +250,22 @@ def _present(plant: Plant, name: str) -> np.ndarray:
     return np.broadcast_to(there, there.shape or (1,))
 
 
-def _list_readings(
-    readings: SensorReadings, place: str = ""
+def _list_readings(readings: SensorReadings) -> list[tuple[str, str, str, list[np.ndarray]]]:
+    """Name, unit, meaning and arrays of each reading; no two have one name."""
+    rows = list(_readings_at(readings, ""))
+    names = unique_names([row[0] for row in rows], set())
+    return [(name, *row[1:]) for name, row in zip(names, rows, strict=True)]
+
+
+def _readings_at(
+    readings: SensorReadings, place: str
 ) -> Iterator[tuple[str, str, str, list[np.ndarray]]]:
-    """Name, unit, meaning and arrays of each reading."""
     for field, value in readings._asdict().items():
         if value is None or field in ("noise", "present"):
             continue
         if field == "modules":
             for name, own in value.items():
-                yield from _list_readings(own, name)
+                yield from _readings_at(own, name)
             continue
         fields = {field: value}
         if isinstance(value, NearestRobot):

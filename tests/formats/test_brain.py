@@ -28,7 +28,6 @@ from mjx_revolve.formats.brain import _list_readings, champion_brain, make_brain
 from mjx_revolve.formats.brain_c import make_brain_c
 from mjx_revolve.formats.brain_python import make_brain_python
 from mjx_revolve.formats.brain_ros import make_brain_node
-from mjx_revolve.formats.links import unique_names
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.sensor_log import trace_sensors
 from mjx_revolve.water.flow import water_of
@@ -153,10 +152,8 @@ def due(fitness):
 
 def as_given(brain, readings):
     """Readings as files take them."""
-    rows = list(_list_readings(readings))
-    names = unique_names([row[0] for row in rows], set())
-    found = {name: np.concatenate([np.ravel(x) for x in row[3]])
-             for name, row in zip(names, rows, strict=True)}  # fmt: skip
+    found = {name: np.concatenate([np.ravel(x) for x in parts])
+             for name, _, _, parts in _list_readings(readings)}  # fmt: skip
     return {signal.name: found[signal.name] for signal in brain.signals}
 
 
