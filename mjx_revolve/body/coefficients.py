@@ -22,7 +22,7 @@ from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.params import apply_overrides, check_overrides, multiply_factors
 from mjx_revolve.body.placement import Module
 from mjx_revolve.inputs.errors import InputError, reading
-from mjx_revolve.inputs.files import read_file
+from mjx_revolve.inputs.files import path_inside, read_file
 from mjx_revolve.inputs.schema import checked, read
 from mjx_revolve.inputs.yaml_reader import load_yaml, parse_yaml
 
@@ -135,9 +135,9 @@ def read_morphology_files(path: str | Path) -> dict[str, bytes]:
     named = data.get("coefficients") if isinstance(data, dict) else None
     if not isinstance(named, str) or not named:
         return found
-    content, beside = read_file(path.parent / named), Path(named)
-    if beside.is_absolute() or ".." in beside.parts:
-        beside = Path(beside.name if beside.name != path.name else f"coefficients_{beside.name}")
-        data["coefficients"] = beside.name
+    content, beside = read_file(path.parent / named), path_inside(named)
+    if beside != Path(named).as_posix():
+        beside = beside if beside != path.name else f"coefficients_{beside}"
+        data["coefficients"] = beside
         found[path.name] = yaml.safe_dump(data, sort_keys=False, allow_unicode=True).encode()
-    return found | {beside.as_posix(): content}
+    return found | {beside: content}

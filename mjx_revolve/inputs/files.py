@@ -165,3 +165,13 @@ def csv_table(rows: Sequence[Mapping[str, object]]) -> bytes:
         writer.writeheader()
     writer.writerows(rows)
     return text.getvalue().encode()
+
+
+def path_inside(named: str) -> str:
+    """Where a file stands in a copy of the folder that names it: one that lies elsewhere, by name.
+
+    Args:
+        named: its path from that folder, or an absolute one.
+    """
+    path = Path(named)
+    return path.name if path.is_absolute() or ".." in path.parts else path.as_posix()

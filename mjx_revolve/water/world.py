@@ -18,7 +18,7 @@ from annotated_types import Ge, Le, MinLen, Unit
 from pydantic import BeforeValidator, InstanceOf, ValidationInfo
 
 from mjx_revolve.inputs.errors import ConstraintError, InputError, note, reading, show
-from mjx_revolve.inputs.files import check_path, read_file
+from mjx_revolve.inputs.files import check_path, path_inside, read_file
 from mjx_revolve.inputs.schema import (
     OFF,
     ONE,
@@ -309,9 +309,8 @@ def read_world_files(path: str | Path) -> dict[str, bytes]:
         return {path.name: content}
     with reading(path):
         field = read_file(find_field(named, path.parent))
-    beside = Path(named)
-    if beside.is_absolute() or ".." in beside.parts:
-        beside = Path(beside.name)
-        data["current_field"] = beside.name
+    beside = path_inside(named)
+    if beside != Path(named).as_posix():
+        data["current_field"] = beside
         content = yaml.safe_dump(data, sort_keys=False, allow_unicode=True).encode()
-    return {path.name: content, beside.as_posix(): field}
+    return {path.name: content, beside: field}
