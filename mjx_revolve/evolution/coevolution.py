@@ -111,7 +111,7 @@ class BodyEvolution(IndividualEvolution):
 
     def _check_features(self) -> None:
         known, archive = self.fitness.features, self.bodies.archive
-        objectives = [name.lstrip("-") for name in self.selection.objectives]
+        objectives = [name.removeprefix("-") for name in self.selection.objectives]
         named = {
             "bodies.selection.objectives": [name for name in objectives if name != "novelty"],
             "bodies.selection.novelty": self.selection.novelty,
@@ -186,10 +186,11 @@ class BodyEvolution(IndividualEvolution):
 
     def evaluate(self, proposal: _Proposal) -> list[Individual]:
         """The living, and the new individuals with what they have learnt, with their scores."""
-        search, living = proposal.search, list(proposal.search.living)
-        if living and self.selection.reevaluate:
-            living = evaluate_again(self.executor, living, proposal.key, search.generation + 1)
-        return [*living, *learn(self.executor, proposal.offspring, proposal.key)]
+        born = learn(self.executor, proposal.offspring, proposal.key)
+        together = [*proposal.search.living, *born]
+        if self.selection.reevaluate:
+            together = evaluate_again(self.executor, together, proposal.key)
+        return together
 
     def tell(self, proposal: _Proposal, results: list[Individual]) -> Generation[BodySearch]:
         """The search with survivors, elites and archives brought up to date.
@@ -209,7 +210,8 @@ class BodyEvolution(IndividualEvolution):
             candidates = self._candidates(together, new, old)
             survivors = self.scheme.survivors(candidates, self.selection, mu, generation)
             living = [together[k] for k in survivors]
-        trials = sum(individual.trials for individual in born) + old * self.selection.reevaluate
+        trials = sum(individual.trials for individual in born)
+        trials += len(together) * self.selection.reevaluate
         past, ids = self._add_most_novel(search, born, new[old:])
         found = replace(
             search,
@@ -253,7 +255,7 @@ class BodyEvolution(IndividualEvolution):
         """Individuals to choose from; the first `old` ones are parents, `new` is their novelty."""
         columns = []
         for name in self.selection.objectives:
-            plain = name.lstrip("-")
+            plain = name.removeprefix("-")
             values = new if plain == "novelty" else features(individuals, [plain])[:, 0]
             columns.append(-values if name.startswith("-") else values)
         objectives = np.stack(columns, -1)

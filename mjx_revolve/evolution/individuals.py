@@ -42,6 +42,8 @@ class Individual:
         score: of `learnt`; NaN without `learnt`.
         measures: of `learnt`, see `measures`.
         trials: brains that were tried.
+        evaluations: of which `score` is the mean, where `learnt` is evaluated again; 0: it is the
+            highest of its trials.
     """
 
     number: int
@@ -56,6 +58,7 @@ class Individual:
     score: float = float("nan")
     measures: Mapping[str, float] = field(default_factory=dict, repr=False)
     trials: int = 0
+    evaluations: int = 0
 
     @cached_property
     def descriptors(self) -> Mapping[str, float]:
@@ -103,6 +106,7 @@ def to_record(individual: Individual, genotype: Genotype) -> dict[str, object]:
         "origin": individual.origin,
         "score": None if individual.score != individual.score else individual.score,
         "trials": individual.trials,
+        "evaluations": individual.evaluations,
         "measures": dict(individual.measures),
         "descriptors": {name: float(x) for name, x in individual.descriptors.items()},
         "brain": individual.brain,
@@ -148,6 +152,7 @@ def from_record(
             score=float("nan") if score is None else float(score),
             measures={str(name): float(x) for name, x in record["measures"].items()},
             trials=int(record["trials"]),
+            evaluations=int(record.get("evaluations", 0)),  # earlier versions counted none
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"individual: expected a record of one; found {show(error)}") from None

@@ -152,38 +152,40 @@ def _taught(learner: _Learner, fitness: BodyFitness) -> Individual:
 
 
 def evaluate_again(
-    executor: Executor, individuals: Sequence[Individual], key: jax.Array, generation: int
+    executor: Executor, individuals: Sequence[Individual], key: jax.Array
 ) -> list[Individual]:
-    """Evaluates learnt brains on a generation's episodes: explicit averaging over time.
+    """Evaluates learnt brains on other episodes of a generation: explicit averaging over time.
 
     Scores of one generation are partly luck, which selection of the best adds up; see Jin and
     Branke, "Evolutionary optimization in uncertain environments — a survey", IEEE Trans.
-    Evolutionary Computation 9(3), 2005.
+    Evolutionary Computation 9(3), 2005. The episodes are not those on which the best brains of
+    `learn` were chosen: those scores are the highest of several and do not count.
 
     Args:
         executor: an executor over a `BodyFitness`.
-        individuals: evaluated once in each generation since their birth; those of which every
-            trial failed, or that are lost with their workers now, stay as they are.
-        key: of the generation, as for `learn`: the same episodes.
-        generation: its number.
+        individuals: those of which every trial failed, or that are lost with their workers now,
+            stay as they are.
+        key: of the generation, as for `learn`.
 
     Returns:
-        The individuals; scores and measures are means over all evaluations, NaN if one blew up.
+        The individuals; scores and measures are means over all of their evaluations here, NaN if
+        one blew up.
     """
     again = [one for one in individuals if one.learnt is not None]
     genes = [learnt_genes(executor.fitness, one) for one in again]
     means = {}
-    scored = score_brains(executor, again, genes, jax.random.split(key)[0]) if again else []
+    scored = score_brains(executor, again, genes, jax.random.fold_in(key, 2)) if again else []
     for one, (scores, measures) in zip(again, scored, strict=True):
         if np.isnan(scores[0]):
             continue
-        share = 1.0 / (generation - one.born + 1)
-        blew_up = np.isneginf(scores[0])
-        score = np.nan if blew_up else one.score + share * (float(scores[0]) - one.score)
-        mean = {
-            name: x + share * (float(measures[name][0]) - x) for name, x in one.measures.items()
-        }
-        means[one.number] = replace(one, score=score, measures=mean)
+        count = one.evaluations + 1
+
+        def mean(old: float, new: float, share: float = 1 / count) -> float:
+            return (1 - share) * old + share * new if share < 1 else new
+
+        score = np.nan if np.isneginf(scores[0]) else mean(one.score, float(scores[0]))
+        found = {name: mean(x, float(measures[name][0])) for name, x in one.measures.items()}
+        means[one.number] = replace(one, score=score, measures=found, evaluations=count)
     return [means.get(one.number, one) for one in individuals]
 
 

@@ -216,12 +216,16 @@ def test_parents_and_children_have_random_streams_of_their_own(folder, monkeypat
 
 
 @pytest.mark.parametrize("kind", ["plus", "generational"])
-def test_scores_of_reevaluated_parents_are_means_over_their_generations(folder, kind):
-    config, executor = start(folder, {"selection": {"type": kind, "reevaluate": True}})
+def test_reevaluated_scores_are_means_over_starts_that_no_brain_was_chosen_on(folder, kind):
+    bodies = {"selection": {"type": kind, "reevaluate": True}, "learning": {"population_size": 3}}
+    config, executor = start(folder, bodies)
     history = generations(config, executor)
     search, last = history[-1]
     fitness, key = executor.fitness, jax.random.key(config.evolution.seed)
-    assert search.trials == 6 + 4 * (6 + 6) and last["champion"] == search.elites[0].score
+    assert (
+        search.trials == 6 * (3 + 1) + 4 * 6 * (3 + 2)
+        and last["champion"] == search.elites[0].score
+    )
     evolution = BodyEvolution(config, executor)
     lines = [line for each, _ in history for line in evolution.logs(each)["individuals.jsonl"]]
     logged = {line["id"]: line["score"] for line in map(json.loads, lines)}
@@ -230,7 +234,7 @@ def test_scores_of_reevaluated_parents_are_means_over_their_generations(folder, 
         wide = np.zeros((1, executor.num_genes), np.float32)
         wide[:, fitness.layout(one.body).columns] = one.genes
         keys = [jax.random.fold_in(key, generation) for generation in range(one.born, 6)]
-        starts = [jax.random.split(each)[0] for each in keys]
+        starts = [jax.random.fold_in(each, 2) for each in keys]
         scores = [score_brains(executor, [one], [wide], each)[0][0][0] for each in starts]
         assert one.score == pytest.approx(np.mean(scores), abs=1e-6)
         assert logged[one.number] == one.score
@@ -245,7 +249,7 @@ def test_what_workers_lose_costs_no_score_and_a_blow_up_costs_all(folder, monkey
         found = [(np.array([score]), dict.fromkeys(one.measures, np.zeros(1)))]
         where = "mjx_revolve.evolution.learning.score_brains"
         monkeypatch.setattr(where, lambda *_, found=found: found)
-        (again,) = evaluate_again(executor, [one], jax.random.key(1), 2)
+        (again,) = evaluate_again(executor, [one], jax.random.key(1))
         assert again.score == pytest.approx(expected, nan_ok=True)
 
 
