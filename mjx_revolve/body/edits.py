@@ -382,12 +382,13 @@ def _insert(
 
 
 def _name_apart(graft: Sequence[Module], kept: Iterable[Module]) -> list[Module]:
-    """A subtree, renamed so that no name is among those kept."""
+    """A subtree with its origins, renamed so that no name is among those kept."""
     taken = {*RESERVED, *(module.name for module in kept)}
     used = taken | {module.name for module in graft}
     found = []
     for module in graft:
         name, count = module.name, 2
+        module = replace(module, origin=module.origin or (0, name))
         if name in taken:
             stem = re.sub(r"_[0-9]+$", "", name)
             while name in used:

@@ -8,9 +8,8 @@ be used for all.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import product
+from types import MappingProxyType
 from typing import Annotated, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -20,6 +19,7 @@ from numpy.typing import ArrayLike
 from mjx_revolve.control.controller import Controller, Gene, gene_indices
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.episodes.bodies_config import BrainsConfig
+from mjx_revolve.genotypes.genotype import Origins
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.schema import Number, read, words
 
@@ -29,8 +29,6 @@ _HIDDEN = 12
 _LENGTH = 0.1
 # A brain of genes by name. (Of a `dict`, messages would name the gene that is wrong.)
 _NAMED = Annotated[Mapping[str, Number], words("genes by name")]
-# The suffix that edits give to the name of a copy.
-_COPY = re.compile(r"_\d+$")
 _FUNCTIONS: tuple[Callable[[np.ndarray], np.ndarray], ...] = (
     np.sin,
     np.tanh,
@@ -96,8 +94,14 @@ class BrainEncoding(Protocol[B]):
     def draw(self, rng: np.random.Generator, layout: GeneLayout) -> B:
         """A brain drawn anew."""
 
-    def inherit(self, rng: np.random.Generator, parents: Sequence[B], layout: GeneLayout) -> B:
-        """A child's brain; its body is the first parent's, but for mutations."""
+    def inherit(
+        self,
+        rng: np.random.Generator,
+        parents: Sequence[B],
+        layout: GeneLayout,
+        origins: Origins = MappingProxyType({}),
+    ) -> B:
+        """A child's brain; its body is the first parent's, but for mutations and what is copied."""
 
     def to_vector(self, brain: B, layout: GeneLayout) -> np.ndarray:
         """The brain as a vector `[size]`."""
@@ -144,7 +148,11 @@ class NamedGenes:
         return _named(layout, self.settings.std_init * rng.standard_normal(len(layout.names)))
 
     def inherit(
-        self, rng: np.random.Generator, parents: Sequence[dict[str, float]], layout: GeneLayout
+        self,
+        rng: np.random.Generator,
+        parents: Sequence[dict[str, float]],
+        layout: GeneLayout,
+        origins: Origins = MappingProxyType({}),
     ) -> dict[str, float]:
         """Genes by name, the first parent's first, with noise.
 
@@ -153,14 +161,18 @@ class NamedGenes:
         """
         noise = self.settings.mutation * rng.standard_normal(len(layout.names))
         fresh = self.settings.std_init * rng.standard_normal(len(layout.names))
-        known: Mapping[str, float] = {k: v for p in reversed(parents) for k, v in p.items()}
-        # The name of a copy is its original's with a number; so is that of a second parent's module
-        # with a name that the first one has, too.
-        copied = {k: v for p in parents for k, v in p.items()}
-        found = [
-            known.get(n, next((copied[x] for x in _originals(n) if x in copied), None))
-            for n in layout.names
-        ]
+        known = {k: v for p in reversed(parents) for k, v in p.items()}
+
+        def find(name: str, gene: Gene) -> float | None:
+            joints = name[len(gene.what) + 1 :].split("~")
+            if gene.place == "robot" or origins.keys().isdisjoint(joints):
+                return known.get(name)
+            # A copy's name may be that of another joint, which the body has lost, or a parent has.
+            which, named = zip(*(origins.get(joint, (0, joint)) for joint in joints), strict=True)
+            own = parents[which[0]] if len(set(which)) == 1 else {}
+            return own.get(f"{gene.what} {'~'.join(named)}")
+
+        found = [find(*gene) for gene in zip(layout.names, layout.genes, strict=True)]
         have = np.array([value is not None for value in found], bool)
         values = np.array([0.0 if value is None else value for value in found])
         for k in np.flatnonzero(~have):
@@ -188,12 +200,6 @@ class NamedGenes:
     def check(self, brain: object) -> dict[str, float]:
         """Genes by name."""
         return read(_NAMED, brain, "brain")
-
-
-def _originals(name: str) -> list[str]:
-    """Genes of which one may be a copy: with the original's joint, of a pair either or both."""
-    ends = [(end, _COPY.sub("", end)) for end in name.split("~")]
-    return ["~".join(chosen) for chosen in product(*ends)]
 
 
 def _named(layout: GeneLayout, values: Iterable[float]) -> dict[str, float]:
@@ -254,7 +260,11 @@ class PatternNetwork:
         return _weights(weights)
 
     def inherit(
-        self, rng: np.random.Generator, parents: Sequence[list[float]], layout: GeneLayout
+        self,
+        rng: np.random.Generator,
+        parents: Sequence[list[float]],
+        layout: GeneLayout,
+        origins: Origins = MappingProxyType({}),
     ) -> list[float]:
         """Each weight is one of the parents', with noise."""
         found = np.array(parents[0])

@@ -92,6 +92,7 @@ def _grow(
     genome: object,
 ) -> Individual:
     """The body that a genome develops into, and its brain at birth."""
+    genome, origins = fitness.genotype.settle(genome)
     body = fitness.genotype.develop(genome)
     layout, brains = fitness.layout(body), fitness.brains
     inheritance = fitness.bodies.brains.inheritance
@@ -100,6 +101,6 @@ def _grow(
     else:
         learnt = inheritance == "lamarckian"
         inherited = [p.learnt if learnt and p.learnt is not None else p.brain for p in parents]
-        brain = brains.inherit(rng, inherited, layout)
+        brain = brains.inherit(rng, inherited, layout, origins)
     numbers = tuple(parent.number for parent in parents)
     return Individual(number, numbers, generation, origin, genome, body, brain)

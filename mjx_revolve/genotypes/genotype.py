@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from mjx_revolve.inputs.errors import InputError, show
 
 T = TypeVar("T")
 G = TypeVar("G")  # a genome
+Origins: TypeAlias = Mapping[str, tuple[int, str]]
+"""Modules that were copied: of which parent, and their names there, by name."""
 
 # Bounds on length and mass are kept up to rounding.
 SLACK = 1 + 1e-9
@@ -45,6 +47,8 @@ class Genotype(NamedTuple, Generic[G]):
             if the body is not in the space. None if bodies cannot be converted.
         to_plain: genome → plain values for JSON, exactly.
         from_plain: the inverse of `to_plain`. Raises `InputError` for anything else.
+        settle: genome that variation has just made → the genome as it is kept, and the origins of
+            modules that were copied, by name (see `Module.origin`).
     """
 
     name: str
@@ -55,6 +59,7 @@ class Genotype(NamedTuple, Generic[G]):
     adopt: Callable[[Morphology], G | None] | None
     to_plain: Callable[[G], object]
     from_plain: Callable[[Any], G]
+    settle: Callable[[G], tuple[G, Origins]] = lambda genome: (genome, {})
 
 
 def accept_all(body: Morphology) -> bool:
@@ -195,6 +200,7 @@ def make_genotype(
     to_plain: Callable[[G], object],
     from_plain: Callable[[Any], G],
     adopt: Callable[[Morphology], G | None] | None = None,
+    settle: Callable[[G], tuple[G, Origins]] = lambda genome: (genome, {}),
 ) -> Genotype[G]:
     """A genotype that keeps to the space, from functions that may leave it.
 
@@ -209,6 +215,7 @@ def make_genotype(
         to_plain: genome → plain values for JSON.
         from_plain: the inverse of `to_plain`; raises `InputError`.
         adopt: body in the space → genome that develops into it; None if there is none.
+        settle: see `Genotype`; by default nothing is copied.
     """
     develop = cached(develop)
 
@@ -260,6 +267,7 @@ def make_genotype(
         adopt=None if adopt is None else adopted,
         to_plain=to_plain,
         from_plain=read,
+        settle=settle,
     )
 
 

@@ -27,7 +27,7 @@ from mjx_revolve.body.edits import (
 from mjx_revolve.body.module_types import ModuleType, Slot
 from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.body.tree import Morphology
-from mjx_revolve.genotypes.genotype import Genotype, Space, make_genotype
+from mjx_revolve.genotypes.genotype import Genotype, Origins, Space, make_genotype
 from mjx_revolve.genotypes.growth import Growth, name_place
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.schema import ConstraintError, NonNegative, checked, read
@@ -102,7 +102,17 @@ def make_tree(space: Space, params: Mapping[str, object], place: str) -> Genotyp
         adopt=lambda body: body,
         to_plain=Morphology.to_mapping,
         from_plain=lambda plain: make_morphology(plain, space.catalogue, source="genome"),
+        settle=_settle,
     )
+
+
+def _settle(body: Morphology) -> tuple[Morphology, Origins]:
+    """The body without the origins of its modules, and these."""
+    origins = {module.name: module.origin for module in body.modules if module.origin}
+    if origins:
+        modules = tuple(replace(module, origin=None) for module in body.modules)
+        body = replace(body, modules=modules)
+    return body, origins
 
 
 def _try(edit: Callable[..., Morphology | None], *arguments: object) -> Morphology | None:
@@ -330,6 +340,7 @@ def _exchange(
     given = _drawn(rng, b)
     if given is None:
         return None
+    b = replace(b, modules=tuple(replace(m, origin=(1, m.name)) for m in b.modules))
     taken = _drawn(rng, a)
     if taken is None:
         return graft_subtree(a, *_pick(rng, free_slots(a)), b, given)

@@ -121,12 +121,17 @@ def test_a_copy_does_as_its_original():
         double = add_module(double, k, 1 if k else 2, "ActiveHinge", name=name)
     before, layout = (layout_of(x, make_cpg, common(make_cpg)) for x in (bare, double))
     parent = {name: 1.0 + k for k, name in enumerate(before.names)}
-    child = brains.inherit(np.random.default_rng(0), [parent], layout)
+    # A joint that had the copy's name before is another one.
+    parent["w fin_2"] = 99.0
+    origins = {f"{name}_2": (0, name) for name in ("fin", "knee", "toe")}
+    child = brains.inherit(np.random.default_rng(0), [parent], layout, origins)
     for old, new in (("w fin", "w fin_2"), ("c knee~toe", "c knee_2~toe_2")):
         assert child[new] == child[old] == parent[old]
     other = dict.fromkeys(parent, -1.0)
-    child = brains.inherit(np.random.default_rng(0), [parent, other], layout)
-    assert child["w fin_2"] == -1 and child["w fin"] == parent["w fin"]
+    origins = {name: (1, old) for name, (_, old) in origins.items()}
+    child = brains.inherit(np.random.default_rng(0), [parent, other], layout, origins)
+    assert child["w fin_2"] == child["c knee_2~toe_2"] == -1
+    assert child["w fin"] == parent["w fin"] and child["c knee~toe"] == parent["c knee~toe"]
 
 
 def test_the_network_by_hand():

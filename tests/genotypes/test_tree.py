@@ -23,11 +23,11 @@ ONE = make_morphology(
 )  # fmt: skip
 
 
-def only(name):
-    """The genotype with one kind of mutation, and 40 mutants of a body."""
+def only(name, body=ONE):
+    """40 mutants of a body by one kind of mutation."""
     genotype = find_genotype("tree", SPACE, dict.fromkeys(RATES, 0) | {name: 1}, "test.yaml")
     rng = np.random.default_rng(0)
-    return [genotype.mutate(rng, ONE) for _ in range(40)]
+    return [genotype.mutate(rng, body) for _ in range(40)]
 
 
 def types(body):
@@ -66,6 +66,22 @@ def test_subtrees_are_duplicated():
         assert names(ONE) < names(body)
         assert all(name.endswith("_2") and name[:-2] in names(ONE) for name in new)
     assert max(body.num_modules for body in only("duplicate")) == 10
+
+
+@pytest.mark.parametrize("kind", ["duplicate", "mirror"])
+def test_copies_know_their_originals(kind):
+    """So do copies of copies, and those in the place of a limb of the same name."""
+    settle = find_genotype("tree", SPACE, {}, "test.yaml").settle
+    for once in only(kind)[:5]:
+        parent, _ = settle(once)
+        known = {m.name: m.type for m in parent.modules}
+        for body in only(kind, parent):
+            kept, origins = settle(body)
+            assert kept == body and settle(kept) == (kept, {})
+            assert names(body) - known.keys() <= origins.keys()
+            for module in body.modules:
+                which, name = origins.get(module.name, (0, module.name))
+                assert which == 0 and known[name] == module.type
 
 
 def test_modules_change_places_types_and_turns():
@@ -136,6 +152,11 @@ def test_crossover_exchanges_subtrees():
     lost = {frozenset(names(ONE) - names(body)) for body in children}
     assert {frozenset({"bow"}), frozenset({"hip", "thigh", "fin", "knee"})} <= lost
     assert {body.name for body in children} == {"one"}
+    # Modules of the second parent are known as such, also where the first has had such a name.
+    for body in [*children, genotype.cross(rng, ONE, children[0])]:
+        origins = genotype.settle(body)[1]
+        assert {which for which, _ in origins.values()} == {1}
+        assert names(body) - names(ONE) <= origins.keys()
     bare = load_morphology("core")
     assert names(genotype.cross(rng, bare, other)) & {"tail", "fluke"}
     assert genotype.cross(rng, other, bare) is other
