@@ -29,7 +29,7 @@ from mjx_revolve.episodes.rollout import (
     open_loop,
     with_variation,
 )
-from mjx_revolve.episodes.starts import draw_gusts, gusty_water, target_path
+from mjx_revolve.episodes.starts import draw_gusts, gusty_water, noise_key, target_path
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.short_repr import short_repr
 from mjx_revolve.numerics.xla import is_traced, jit
@@ -226,8 +226,8 @@ def simulate(
             if leaf.ndim > 1 or (leaf.ndim == 1 and leaf.shape[0] not in (1, steps)):
                 raise InputError(f"water: expected numbers or [{steps}]; found {list(leaf.shape)}")
     if context is None:
-        noise_key = jax.random.fold_in(jax.random.key(0) if key is None else key, 3)
-        context = EpisodeContext(noise=jax.random.bits(noise_key, (), "uint32"))
+        noise = noise_key(jax.random.key(0) if key is None else key)
+        context = EpisodeContext(noise=jax.random.bits(noise, (), "uint32"))
     context = jax.tree.map(jnp.asarray, context)
     if variation is not None:
         if engine != "population":

@@ -79,13 +79,14 @@ def draw_starts(task: TaskConfig, world: World, key: jax.Array, steps: int) -> S
         The starts.
     """
     trials = task.trials
+    # `split` has the keys of `fold_in` with 0 to 3: all others have numbers of their own.
     place_key, tilt_key, yaw_key, current_key = jax.random.split(key, 4)
     place = task.start_position * jax.random.normal(place_key, (3, trials))
     tilt = task.start_tilt * jax.random.normal(tilt_key, (2, trials))
     yaw = task.start_yaw * jax.random.normal(yaw_key, (trials,))
     quat = _euler_quat(tilt[0], tilt[1], yaw)
     gusts = None if world.gust is None else draw_gusts(world, key, steps, trials)
-    noise = jax.random.bits(jax.random.fold_in(key, 3), (trials,), "uint32")
+    noise = jax.random.bits(noise_key(key), (trials,), "uint32")
     starts = Starts(place, quat, None, gusts, noise, *_draw_target(task, key))
     starts = starts._replace(variation=_draw_variation(task, key), course=_draw_course(task, key))
     if task.current_std == 0 and not world.waves:
@@ -96,10 +97,15 @@ def draw_starts(task: TaskConfig, world: World, key: jax.Array, steps: int) -> S
     water = Water(full + world.surface_height, (x + extra[0], y + extra[1], full + z))
     if world.waves:
         # Episodes begin at a random time of the waves.
-        time_key = jax.random.fold_in(key, 2)
+        time_key = jax.random.fold_in(key, 9)
         water = water._replace(time=jax.random.uniform(time_key, (trials,), maxval=_SEA))
     water = jax.tree.map(lambda x: jnp.broadcast_to(x, (trials,)), water)
     return starts._replace(water=water)
+
+
+def noise_key(key: jax.Array) -> jax.Array:
+    """The key of sensors' noise in a key's episodes."""
+    return jax.random.fold_in(key, 10)
 
 
 def _draw_target(task: TaskConfig, key: jax.Array) -> tuple[jax.Array | None, jax.Array | None]:
@@ -229,7 +235,7 @@ def draw_gusts(
 ) -> Float[Array, "rows 3 trials"]:
     """Paths of gusts around the current, `[steps + 1, 3, trials]` [m/s]; `key`: of the episodes."""
     assert world.gust is not None
-    return gust_path(world.gust, jax.random.fold_in(key, 1), steps, world.timestep, trials)
+    return gust_path(world.gust, jax.random.fold_in(key, 8), steps, world.timestep, trials)
 
 
 def gusty_water(world: World, path: jax.Array, water: Water | None = None) -> Water:

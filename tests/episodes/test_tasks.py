@@ -204,6 +204,17 @@ def test_targets_are_drawn_anew_for_each_episode_and_move():
     assert np.abs(np.arctan2(towards[1], towards[0])).max() <= 0.3 + 1e-6
 
 
+def test_what_is_drawn_for_a_start_is_independent():
+    """No two of the tilt, the first gust, the heading and the time of the sea are the same draw."""
+    world = load_world("lake", gust={"std": 1}, waves=[{"amplitude": 0.1, "period": 2}])
+    task = TaskConfig(type="speed", start_tilt=0.01, start_yaw=0.01, start_position=1, trials=500)
+    starts = draw_starts(task, world, jax.random.key(0), 1)
+    w, x, y, z = np.asarray(starts.quat)
+    rows = [x / w, y / w, z / w, *starts.place, *starts.gusts[0, :2], starts.water.time]
+    ranks = np.argsort(np.argsort([*rows, starts.noise], axis=1), axis=1)
+    assert np.abs(np.corrcoef(ranks) - np.eye(len(ranks))).max() < 0.2
+
+
 def test_a_target_that_flees_must_be_followed():
     """From 4 m away to 1 m, while the target goes 1 m further."""
     row = np.array([0.0, 1.0, 4.0])
