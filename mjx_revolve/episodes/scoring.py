@@ -19,6 +19,7 @@ from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.tasks import Task
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.bed import bed_height
+from mjx_revolve.water.flow import drift_speed
 from mjx_revolve.water.world import World
 
 # Score of a rollout that blew up. Finite, because optimisers' averages and sorts are not made for
@@ -110,10 +111,10 @@ def max_distance(settings: TaskConfig, world: World, geometry: BodyGeometry) -> 
 
     `geometry`: of the bodies, `[lanes]` or one.
     """
-    current = np.linalg.norm(world.current) + 4 * settings.current_std
+    drift = drift_speed(world) + 4 * settings.current_std
     fall = 0.5 * world.gravity * settings.duration**2
     fastest = (_FASTEST**2 + geometry.thrust / _LEAST_DRAG) ** 0.5
-    swum = (fastest + current) * settings.duration + 4 * settings.start_position
+    swum = (fastest + drift) * settings.duration + 4 * settings.start_position
     return swum + geometry.sinks * fall + geometry.length
 
 

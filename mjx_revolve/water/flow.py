@@ -46,6 +46,21 @@ def is_uniform(world: World) -> bool:
     return world.shear is None and world.current_field is None and not world.waves
 
 
+def drift_speed(world: World) -> float:
+    """A speed that the water carries things with at most, anywhere [m/s].
+
+    Gusts count with four standard deviations. Waves do not: their water goes round.
+    """
+    steady = [np.linalg.norm(world.current)]
+    if world.shear is not None:
+        steady.append(np.linalg.norm(world.shear.velocity))
+    if world.current_field is not None:
+        steady.append(np.linalg.norm(world.current_field.velocity, axis=-1).max())
+    if world.gust is not None:
+        steady.append(4 * np.linalg.norm(world.gust.std))
+    return float(sum(steady))
+
+
 def needs_horizontal_position(world: World) -> bool:
     """Whether a step must know where its bodies are, horizontally."""
     return not is_uniform(world)

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from laboratory import make_track, swimmer
-from mjx_revolve import InputError, make_fitness
+from mjx_revolve import InputError, load_world, make_fitness
+from mjx_revolve.engine.plant import body_geometry
 from mjx_revolve.episodes.config import TaskConfig
-from mjx_revolve.episodes.scoring import WORST
+from mjx_revolve.episodes.scoring import WORST, max_distance
 from mjx_revolve.episodes.tasks import TASKS, find_task, score_unit, shown_measure
+from mjx_revolve.water.currents import CurrentField
 
 KEY = jax.random.key(7)
 # The smallest robot with joints: compiles fast.
@@ -65,6 +67,20 @@ def test_a_blown_up_individual_scores_worst_and_spreads_nothing(fitness, populat
     assert found[3] == WORST == fitness.worst_score
     others = np.arange(70) != 3
     np.testing.assert_array_equal(found[others], scores[others])
+
+
+def test_what_the_water_carries_off_does_not_blow_up(fitness):
+    figure, task = body_geometry(fitness.robot), fitness.settings
+    still = max_distance(task, load_world("empty_underwater"), figure)
+    field = CurrentField([0.0], [0.0], [0.0], np.reshape([4.0, 0, 3.0], (1, 1, 1, 3)))
+    for motion in (
+        {"current": (0, 5, 0)},
+        {"shear": {"velocity": [5, 0, 0]}},
+        {"gust": {"std": [0, 1.25, 0]}},
+        {"current_field": field},
+    ):
+        moved = max_distance(task, load_world("empty_underwater", **motion), figure)
+        assert moved == pytest.approx(still + 5 * task.duration)
 
 
 @pytest.mark.long
