@@ -338,13 +338,14 @@ def squared_distances(position: Vec, worlds: int, present: jax.Array) -> jax.Arr
         present: `[lanes]` whether a slot is taken.
 
     Returns:
-        `[worlds, n, n]` [m²], infinite to itself and to empty slots.
+        `[worlds, n, n]` [m²], infinite to itself, to empty slots and to robots that blew up.
     """
     own = tuple(x.reshape(worlds, -1) for x in position)
     there = present.reshape(worlds, -1)
     away = tuple(x[:, None, :] - x[:, :, None] for x in own)
     real = there[:, None, :] & there[:, :, None] & ~jnp.eye(there.shape[-1], dtype=bool)
-    return jnp.where(real, dot(away, away), jnp.inf)
+    square = dot(away, away)
+    return jnp.where(real & ~jnp.isnan(square), square, jnp.inf)
 
 
 def nearest_robot(

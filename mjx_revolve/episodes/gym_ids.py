@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.packages import check_package
 
 CONFIGS = (
@@ -48,13 +49,20 @@ def register_envs() -> None:
 
 
 def make_env(config: Any, **settings: Any) -> Any:
-    """A single `gymnasium.Env`, with the arguments of `make_vector_env`.
+    """A single `gymnasium.Env`, with the arguments of `make_vector_env` but for those of many.
 
     On a CPU it costs as much as 64 environments. An episode that is over must be reset; `reset`
     without a seed begins the seed's next episode.
+
+    Raises:
+        InputError: there is a `num_envs` or an `autoreset_mode`; otherwise as `make_vector_env`.
     """
     from mjx_revolve.episodes.vector_env import make_vector_env
 
+    for name in ("num_envs", "autoreset_mode"):
+        if name in settings:
+            found = show(settings[name])
+            raise InputError(f"{name}: expected none, as this is a single Env; found {found}")
     settings.pop("render_mode", None)
     return _make_class()(make_vector_env(config, 1, **settings))
 

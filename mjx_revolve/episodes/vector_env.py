@@ -131,8 +131,8 @@ def _make_class() -> type:
 
             Args:
                 seed: a whole number, of the first environment, the next one's is one higher; or one
-                    for each; None: the next episode of each environment's own seed, at first drawn
-                    by the operating system.
+                    for each; None, for all or for one: the next episode of the environment's own
+                    seed, at first drawn by the operating system.
                 options: `{"reset_mask": [num_envs] of bool}` for some of them only.
 
             Returns:
@@ -142,17 +142,18 @@ def _make_class() -> type:
                 InputError: the seed or the mask is wrong.
             """
             mask = self._read_mask(options)
-            if seed is None and self._state is None:
-                seed = int(self.np_random.integers(2**32))
-            if seed is None:
-                assert self._state is not None
-                seeds = np.asarray(self._join(self._state.seed))
-                episodes = self._join(self._state.episode) + 1
+            if self._state is None:
+                seeds = self._read_seeds(int(self.np_random.integers(2**32)))
+                episodes = np.zeros(self.num_envs, np.int32)
             else:
-                seeds = self._read_seeds(seed)
-                episodes = jnp.zeros(self.num_envs, jnp.int32)
+                seeds = np.asarray(self._join(self._state.seed), np.int64)
+                episodes = np.asarray(self._join(self._state.episode)) + 1
+            if seed is not None:
+                given = self._read_seeds(seed)
+                seeds = np.where(given < 0, seeds, given)
+                episodes = np.where(given < 0, episodes, 0)
                 super().reset(seed=int(seeds[0]))
-            state, seen = self._begin(jnp.asarray(seeds), episodes)
+            state, seen = self._begin(jnp.asarray(seeds, jnp.uint32), jnp.asarray(episodes))
             if mask is not None and self._state is not None:
                 chosen = jnp.asarray(mask)
                 old = self._state, self._split(jnp.asarray(self._seen))
@@ -161,17 +162,22 @@ def _make_class() -> type:
             self._state, self._seen = state, np.array(seen, np.float32)
             return self._seen.copy(), {}
 
-        def _read_seeds(self, seed: int | Sequence[int | None] | None) -> np.ndarray:
-            found = np.asarray(seed)
-            whole = np.issubdtype(found.dtype, np.integer) and found.shape in ((), (self.num_envs,))
+        def _read_seeds(self, seed: int | Sequence[int | None]) -> np.ndarray:
+            """`[num_envs]` seeds, -1 for None."""
+            found, size = np.asarray(seed), self.num_envs
+            whole = np.issubdtype(found.dtype, np.integer) and found.shape in ((), (size,))
+            if found.dtype == object and found.shape == (size,):
+                kept = [0 if x is None else x for x in found]
+                known = self._read_seeds(kept)
+                return np.where([x is None for x in found], -1, known)
             if not whole or not np.all((found >= 0) & (found < 2**32)):
                 raise InputError(
                     f"seed: expected a whole number from 0 to {2**32 - 1}, or {self.num_envs} of "
                     f"them; found {seed!r}"
                 )
             if found.shape == ():
-                found = (int(found) + np.arange(self.num_envs, dtype=np.int64)) % 2**32
-            return found.astype(np.uint32)
+                found = (int(found) + np.arange(size, dtype=np.int64)) % 2**32
+            return found.astype(np.int64)
 
         def _read_mask(self, options: Mapping[str, object] | None) -> np.ndarray | None:
             if not options or "reset_mask" not in options:

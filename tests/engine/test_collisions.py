@@ -179,6 +179,13 @@ def test_who_is_nearest():
             assert np.allclose(toward[:, k], place[:, best] - place[:, k])
             assert tag[k] == tags[best]
     assert np.allclose(toward[:, 7], (0, 0, NO_NEIGHBOUR)) and tag[7] == 0
+    # Robots that are no longer finite are not seen, as if they were gone.
+    gone = int(np.flatnonzero(present)[0])
+    place[0, gone], there = np.nan, present & (np.arange(12) != gone)
+    blind = nearest_robot(tuple(map(jnp.asarray, place)), 2, present, jnp.asarray(tags))
+    left = nearest_robot(tuple(map(jnp.asarray, place)), 2, jnp.asarray(there), jnp.asarray(tags))
+    for a, b in zip((*blind[0], blind[1]), (*left[0], left[1]), strict=True):
+        assert np.array_equal(a[there], b[there])
 
 
 # Edges [m] and masses [kg]; two of each meet.

@@ -10,6 +10,7 @@ import pytest
 from laboratory import OAR, check_refused, swimmer
 from mjx_revolve import InputError, make_fitness, make_vector_env, simulate
 from mjx_revolve.engine.plant import actuators_of
+from mjx_revolve.episodes.gym_ids import make_env
 from mjx_revolve.episodes.scoring import WORST
 
 gymnasium = pytest.importorskip(
@@ -221,6 +222,11 @@ def test_a_seed_says_everything(env, episode):
     assert np.array_equal(other[0, :-1], episode[0][0, 1:])
     given = env.reset(seed=[7, 3, 3, 6, 5])[0]
     assert np.array_equal(given[[1, 2, 3, 4]], episode[0][0][[0, 0, 3, 2]])
+    next_ones = env.reset()[0]
+    env.reset(seed=[7, 3, 3, 6, 5])
+    some = env.reset(seed=[None, 3, None, None, None])[0]
+    assert np.array_equal(some[1], given[1])
+    assert np.array_equal(some[[0, 2, 3, 4]], next_ones[[0, 2, 3, 4]])
 
 
 @pytest.mark.slow
@@ -287,7 +293,9 @@ def test_wrong_calls_get_one_message(config):
     env = make_vector_env(config, 2)
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros((2, 1)))
-    for seed in (-1, 2**32, 0.5, [1, 2, 3], "a"):
+    with pytest.raises(InputError, match="autoreset_mode: expected none, as this is a single Env"):
+        make_env(config, autoreset_mode="SameStep")
+    for seed in (-1, 2**32, 0.5, [1, 2, 3], [None], ["a", None], "a"):
         with pytest.raises(InputError, match="seed: expected a whole number"):
             env.reset(seed=seed)
     with pytest.raises(InputError, match=r"reset_mask: expected \[2\] of bool"):
