@@ -92,6 +92,13 @@ def _make_brain(plant: Plant, settings: Any, source: str, body: Morphology | Non
         )
     brain, file = body.brain, body.path or body.name
     if isinstance(brain, Mapping) and "neurons" in brain:
+        for name in CONTROLLERS["brain"].settings:
+            usual, found = type(settings).model_fields[name].default, getattr(settings, name)
+            if found != usual:
+                raise InputError(
+                    f"{source}: controller.{name}: expected {usual:g}, as the brain of {file} is a "
+                    f"network of neurons, which has none; found {found:g}"
+                )
         return make_neural_network(plant, body, file)
     kind = brain.get("type") if isinstance(brain, Mapping) else brain
     if kind == "rlpower-splines":

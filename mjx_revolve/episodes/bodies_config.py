@@ -23,6 +23,9 @@ from mjx_revolve.inputs.user_code import short_name
 
 Scheme = Literal["plus", "comma", "generational", "steady", "nsga2", "map_elites", "random"]
 """How survivors are chosen; `evolution.selection.SCHEMES` has the functions."""
+# From which share of real individuals on a block is better filled up than shared: a body by itself
+# takes three quarters of the time, or less.
+_WORTH = 0.75
 _MOST_CELLS = 10_000_000  # of a grid, 80 MB for a number of each: a choice
 
 
@@ -64,6 +67,11 @@ class LearningConfig(Settings):
         """Brains that one body tries."""
         return self.population_size * self.generations
 
+    def blocks_of_body(self, block: int) -> int:
+        """Blocks of so many individuals that one body's brains fill; 0: bodies share blocks."""
+        blocks = -(-self.population_size // block)
+        return blocks if self.population_size >= _WORTH * block * blocks else 0
+
 
 class SelectionConfig(Settings):
     """Selection of parents and survivors."""
@@ -82,8 +90,8 @@ class SelectionConfig(Settings):
     max_age: Annotated[Integer, Ge(1)] | None = None
     """Generations after which an individual is removed, however good it is."""
     reevaluate: bool = False
-    """Whether parents are evaluated again in each generation, on its starts; their scores and
-    measures are means over all evaluations."""
+    """Whether parents and children are evaluated in each generation on starts that no brain was
+    chosen on; scores and measures are means over all of these evaluations."""
     objectives: Annotated[TupleOf[str], MinLen(1)] = ("score",)
     """Maximised, or with a minus before it minimised: `score`, `novelty`, or a measure or
     descriptor by name. `nsga2` takes several, all others one."""
@@ -155,7 +163,8 @@ class BodiesConfig(Settings):
     mutation: Share = 0.8
     """Share of the crossed children that are mutated; those that are not crossed always are [-]."""
     crossover: Share = 0.5
-    """Share of the children that have two parents [-]."""
+    """Share of the children that have two parents, of those that are no clones; in a colony all
+    have two, and so many cross their bodies [-]."""
     cloning: Share = 0.0
     """Share of the children that have their first parent's body as it is: only their brains are
     mutated, and learn [-]."""
@@ -201,8 +210,14 @@ class BodiesConfig(Settings):
         if selection.type == "map_elites" and selection.objectives != ("score",):
             best = "score, as the cells of map_elites keep the best by it"
             raise ConstraintError("selection.objectives", best, ", ".join(selection.objectives))
-        wants = any(name.lstrip("-") == "novelty" for name in selection.objectives)
+        wants = any(name.removeprefix("-") == "novelty" for name in selection.objectives)
         if wants and not selection.novelty:
             named = "descriptors or measures, because novelty is an objective"
             raise ConstraintError("selection.novelty", named, "none")
+        if selection.novelty and not wants:
+            none = "none, as novelty is no objective"
+            raise ConstraintError("selection.novelty", none, ", ".join(selection.novelty))
+        if self.learning.strategy_params and self.learning.generations == 1:
+            none = "none, as with one generation no strategy learns"
+            raise ConstraintError("learning.strategy_params", none, "some")
         return self

@@ -128,6 +128,10 @@ class ColonyConfig(Settings):
             raise ConstraintError(
                 "look", f"at most the interval ({self.interval:g} s)", f"{self.look:g}"
             )
+        looks = self.interval / self.look
+        if abs(looks - round(looks)) > 1e-6 * looks:
+            whole = f"a whole part of the interval ({self.interval:g} s)"
+            raise ConstraintError("look", whole, f"{self.look:g}")
         if 2 * self.birth.radius > self.arena.size:
             wide = f"at most half of the arena's size ({self.arena.size / 2:g} m)"
             raise ConstraintError("birth.radius", wide, f"{self.birth.radius:g}")

@@ -88,6 +88,9 @@ OLDER_WORLD = {"drag": "faces", "self_contact": False}
 """Values of worlds in run folders that do not state them; newer folders do (`state_world`)."""
 # Tasks with a target.
 _TO_TARGETS = ("reach_target", "search", "escape")
+# Tasks that count less away from a depth, and those that look along `direction`.
+_AT_DEPTH = ("directed_swim", "speed", "follow_course", "escape", "follow_bed", "crawl")
+_DIRECTED = ("directed_swim", "hold_heading", "follow_bed", "crawl")
 
 
 def _check_measure(name: str) -> str:
@@ -133,15 +136,18 @@ class ControllerConfig(Section):
     period late and without jerks, as from boards that interpolate; `hold`: they are held. Held
     targets jerk the servos, and steps of 5 ms are too long to resolve the jerks."""
     max_frequency: Annotated[Positive, Le(20), Unit("Hz")] = 2.0
-    """The fastest oscillation, half of `rate` at most [Hz]."""
+    """Upper end of the gene for frequency, half of `rate` at most: of `sine` and `splines` the
+    common frequency, of `cpg` that of an uncoupled oscillator (coupled ones may be up to twice as
+    fast), of `sensory_cpg` that before feedback adds to it, of `mlp` and `rnn` that of the clock
+    among their inputs [Hz]."""
     amplitude: Annotated[Positive, Le(1), Unit("-")] = 1.0
-    """Largest amplitude of each sine, as a fraction of the hinge's range, which clips their sum
-    [-]."""
+    """Largest amplitude of each sine, as a share of half the hinge's range: 1 swings from end to
+    end; the range clips their sum [-]."""
     harmonics: Annotated[Integer, Ge(1), Le(8)] = 1
     """Number of sines that are added at each hinge; `type: sine` only [-]."""
     gain: Annotated[Positive, Unit("-")] = 2.0
     """Largest response to an error of normal size, or to a sensor at the end of its range, as a
-    share of the range; `type: feedback` and `sensory_cpg` [-]."""
+    share of half the hinge's range; `type: feedback` and `sensory_cpg` [-]."""
     depth: Annotated[NonNegative, Unit("m")] | None = None
     """Depth that `type: feedback` holds; by default that of the task's start [m]."""
     hidden: Annotated[Integer, Ge(1), Le(64)] = 8
@@ -267,8 +273,9 @@ class TaskConfig(Section):
     """Height above the bed: of the core at the start, then of the robot's `point`; `follow_bed`
     requires it [m]."""
     depth_tolerance: Annotated[Positive, Unit("m")] = 0.25
-    """Distance from the start depth, or from `height`, up to which progress counts in full; beyond,
-    it counts less and less, from twice the distance on not at all [m]."""
+    """Distance from the start depth, from `height` or, of `crawl`, from the bed, up to which
+    progress counts in full; beyond, it counts less and less, from twice the distance on not at
+    all [m]."""
     energy_weight: Annotated[NonNegative, Unit("1/J")] = 0.0
     """Score lost per joule of work of servos and propellers, summed without sign [1/J]."""
     start_tilt: Annotated[NonNegative, Unit("rad")] = 0.1
@@ -329,12 +336,17 @@ class TaskConfig(Section):
             "course_turn": ("course_changes", self.course_changes),
             "touch": ("search or escape", own or self.type in ("search", "escape")),
             "height": ("follow_bed", own or self.type == "follow_bed"),
+            "depth_tolerance": (_one_of(_AT_DEPTH), own or self.type in _AT_DEPTH),
+            "direction": (
+                f"course_spread, nor {_one_of(_DIRECTED)}",
+                own or self.course_spread is not None or self.type in _DIRECTED,
+            ),
         }
         for name, (other, given) in needed.items():
             usual, value = type(self).model_fields[name].default, getattr(self, name)
             if not given and value != usual:
-                what = "none" if usual is None else f"{usual:g}"
-                raise ConstraintError(name, f"{what}, as there is no {other}", f"{value:g}")
+                what = f"{'none' if usual is None else _plain(usual)}, as there is no {other}"
+                raise ConstraintError(name, what, _plain(value))
         level = {
             "a course_spread": self.course_spread is not None,
             "a horizon": self.horizon is not None and self.type == "directed_swim",
@@ -349,6 +361,14 @@ class TaskConfig(Section):
                 "direction", "a vector of some length", show(list(self.direction))
             )
         return self
+
+
+def _one_of(names: Sequence[str]) -> str:
+    return f"{', '.join(names[:-1])} or {names[-1]}"
+
+
+def _plain(value: Any) -> str:
+    return show(list(value)) if isinstance(value, tuple) else f"{value:g}"
 
 
 class EvolutionConfig(Settings):

@@ -60,6 +60,11 @@ def test_defaults(folder):
 ("task={type: follow_course, course_spread: 1, direction: [0, 0, 1]}", "task.direction: "
          "expected one that is not upright, as there is a course_spread, which is level; found"),
 ("task.target_speed=0.1", "task.target_speed: expected 0, as there is no target or target_dist"),
+("task={type: speed, direction: [0, 1, 0]}", "task.direction: expected [1.0, 0.0, 0.0], as there"),
+("task={type: hold_depth, depth_tolerance: 1}", "task.depth_tolerance: expected 0.25, as there "),
+("bodies={selection: {novelty: [mass]}}", "bodies.selection.novelty: expected none, as novelty is"),
+("bodies={learning: {strategy_params: {a: 1}}}", "bodies.learning.strategy_params: expected none"),
+("colony={look: 4}", "colony.look: expected a whole part of the interval (10 s); found 4"),
 ("task.course_turn=1", "task.course_turn: expected 3.14159, as there is no course_changes; fou"),
 ("task={type: hold_heading, direction: [0, 0, 1]}", "task.direction: expected one that is not "
          "upright, as there is task.type hold_heading, which is level"),
