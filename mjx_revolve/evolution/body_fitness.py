@@ -38,9 +38,6 @@ from mjx_revolve.inputs.errors import InputError
 
 # Random bodies from which the number of parts in a row of the tables follows. A choice.
 _EXAMPLES = 64
-# From which share of real individuals on a block is better filled up than shared: a body by itself
-# takes three quarters of the time, or less.
-_WORTH = 0.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,10 +82,8 @@ class BodyFitness:
     @property
     def one_body_per_block(self) -> bool:
         """Whether each block holds one body."""
-        tried, block = self.bodies.learning.population_size, self.block_size
-        if block is None:
-            return False
-        return tried >= _WORTH * block * -(-tried // block)
+        block = self.block_size
+        return block is not None and self.bodies.learning.blocks_of_body(block) > 0
 
     @cached_property
     def identity(self) -> str:
@@ -196,7 +191,9 @@ def _ask_for_measures(config: Config) -> Config:
     """The configuration, with the measures of objectives and archive added to `task.measures`."""
     bodies = config.bodies
     assert bodies is not None
-    named = [name.lstrip("-") for name in (*bodies.selection.objectives, *bodies.selection.novelty)]
+    named = [
+        name.removeprefix("-") for name in (*bodies.selection.objectives, *bodies.selection.novelty)
+    ]
     named += bodies.archive.axes if bodies.archive else ()
     extra = [name for name in named if name in MEASURES and MEASURES[name].record]
     wanted = tuple(dict.fromkeys((*config.task.measures, *extra)))

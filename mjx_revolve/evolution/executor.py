@@ -33,8 +33,9 @@ def choose_workers(config: Config) -> int:
     blocks = -(-config.evolution.population_size // block)
     if config.bodies is not None:
         count = config.bodies.selection.offspring or config.evolution.population_size
-        tried = config.bodies.learning.population_size
-        blocks = -(-count * tried // block)
+        learning = config.bodies.learning
+        own = count * learning.blocks_of_body(block)
+        blocks = own or -(-count * learning.population_size // block)
     return min(runtime.usable_cores(), blocks)
 
 

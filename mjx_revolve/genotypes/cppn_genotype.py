@@ -17,6 +17,7 @@ import numpy as np
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.genotypes.cppn import (
     CPPN,
+    Connection,
     CPPNSettings,
     cross_cppns,
     draw_cppn,
@@ -79,10 +80,13 @@ def _draw(rng: np.random.Generator, outputs: int, settings: CPPNSettings) -> CPP
     """A random network, biased so that limbs end."""
     network = draw_cppn(rng, _INPUTS, outputs, settings)
     more = {_ONE: -_SLOPE * float(rng.uniform(*_DISTANCES)), _DEPTH: _SLOPE}
+    wanted = [(source, 0) for source in more]
     links = [
-        link._replace(weight=link.weight + more.get(link.source, 0.0)) if link.target == 0 else link
+        link._replace(weight=link.weight + more.pop(link.source)) if link[:2] in wanted else link
         for link in network.links
     ]
+    # A node may have split one of them.
+    links += [Connection(source, 0, weight) for source, weight in more.items()]
     return network._replace(links=tuple(links))
 
 

@@ -22,7 +22,7 @@ from mjx_revolve.episodes.config import load_config
 from mjx_revolve.evolution import jobs
 from mjx_revolve.evolution import run_folder as runs
 from mjx_revolve.evolution.blocks import split_blocks
-from mjx_revolve.evolution.executor import Executor, make_executor
+from mjx_revolve.evolution.executor import Executor, choose_workers, make_executor
 from mjx_revolve.evolution.gene_search import GeneEvolution
 from mjx_revolve.evolution.generations import run_generations
 from mjx_revolve.evolution.jobs import Limits, WorkerError, make_job, open_job
@@ -90,6 +90,14 @@ def test_blocks_have_one_shape_and_are_padded_with_their_first_row(size):
     assert [block.shape for block in blocks] == [(4, 2)] * -(-size // 4)
     assert np.array_equal(np.concatenate(blocks)[:size], population)
     assert all((row == blocks[-1][0]).all() for row in np.concatenate(blocks)[size:])
+
+
+def test_there_are_workers_for_all_blocks(monkeypatch):
+    """Of 24 bodies with two trials, 48 and 24 brains fill blocks of their own, 20 share them."""
+    monkeypatch.setattr("mjx_revolve.numerics.runtime.usable_cores", lambda: 99)
+    for tried, blocks in ((48, 48), (24, 24), (20, 15)):
+        settings = [f"bodies.learning.population_size={tried}", "bodies.selection.offspring=24"]
+        assert choose_workers(load_config("lake_coevolve", settings)) == blocks
 
 
 def test_without_workers_or_blocks_a_pool_is_its_fitness():
