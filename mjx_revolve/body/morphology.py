@@ -413,15 +413,24 @@ def trim_neutral(morphology: Morphology, density: float) -> Morphology:
         density: of the water [kg/m³].
 
     Returns:
-        The same robot with `density * volume == mass` (to rounding); saving keeps it.
+        The same robot with `density * volume == mass` (to rounding), parts that the water does not
+        lift left out of the volume; saving keeps it.
 
     Raises:
-        InputError: the robot floats, so that no added volume can trim it.
+        InputError: the robot floats, or the water does not lift its core: no added volume can trim
+            it.
     """
     density = read(Annotated[Positive, Unit("kg/m3")], density, "density")
     core = morphology.modules[0]
+    if core.kind.parts[0].buoyancy == "off":
+        raise InputError(
+            f"{morphology.path or morphology.name}: expected a core that the water lifts, to be "
+            "trimmed by its volume; found buoyancy off"
+        )
+    parts = [part for module in morphology.modules for part in module.kind.parts]
+    dead = sum(part.total_volume for part in parts if part.buoyancy == "off")
     inside = sum(part.electronics_volume for part in core.kind.parts)
-    total = morphology.mass / density - (morphology.volume - inside)
+    total = morphology.mass / density - (morphology.volume - dead - inside)
     if total < -1e-9 * morphology.volume:  # neutral to rounding counts as neutral
         raise InputError(
             f"{morphology.path or morphology.name}: expected a robot that sinks in water of "

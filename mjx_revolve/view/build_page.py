@@ -98,11 +98,15 @@ def make_build_page(robot: Robot, title: str = "") -> str:
 
 def list_parts(body: Morphology) -> list[list[Module]]:
     """The modules by type; those with masses or volumes of their own count as types."""
-    kinds: dict[tuple[str, float, float], list[Module]] = {}
+    kinds: list[list[Module]] = []
     for module in body.modules:
-        key = module.type, round(module.kind.mass, 7), round(module.kind.volume, 10)
-        kinds.setdefault(key, []).append(module)
-    return [*kinds.values()]
+        same = (found for found in kinds if found[0].type == module.type)
+        group = next((found for found in same if found[0].kind == module.kind), None)
+        if group is None:
+            kinds.append([module])
+        else:
+            group.append(module)
+    return kinds
 
 
 def _describe(kind: ModuleType, part: Part) -> str:
@@ -116,8 +120,10 @@ def _describe(kind: ModuleType, part: Part) -> str:
         words.append(
             "fixed to the parent" if part is kind.parts[0] else "moves; the servo, to buy, is in it"
         )
+    # Of both together the centre is given; that of the material is the box's.
+    both = (part.volume + part.electronics_volume) / (part.electronics_volume or 1.0)
     for volume, what, center in (
-        (part.electronics_volume, "sealed volume", np.asarray(part.center_of_volume)),
+        (part.electronics_volume, "sealed volume", both * np.asarray(part.center_of_volume)),
         (part.ballast_volume, "ballast or float", np.asarray(part.ballast_position)),
     ):
         if volume:
@@ -126,6 +132,11 @@ def _describe(kind: ModuleType, part: Part) -> str:
         place = _numbers(1e3 * np.asarray(part.ballast_position), 4)
         words.append(f"{1e3 * part.ballast_mass:.4g} g of ballast at ({place}) mm")
     return ", ".join(words)
+
+
+def _lifting(part: Part) -> float:
+    """The volume by which the water lifts a part [m³]."""
+    return 0.0 if part.buoyancy == "off" else part.total_volume
 
 
 def weigh(robot: Robot) -> Balance:
@@ -137,11 +148,11 @@ def weigh(robot: Robot) -> Balance:
         for part in module.kind.parts:
             for total, center, sums in (
                 (part.total_mass, part.center_of_mass, weighed),
-                (part.total_volume, part.displaced_center, lifted),
+                (_lifting(part), part.displaced_center, lifted),
             ):
                 local = np.add(part.position, center)
                 sums += total * (module.position + module.rotation @ local)
-            mass, volume = mass + part.total_mass, volume + part.total_volume
+            mass, volume = mass + part.total_mass, volume + _lifting(part)
             sealed += part.electronics_volume + part.ballast_volume
     return Balance(
         mass=1e3 * mass,

@@ -365,6 +365,10 @@ def test_trim_neutral(tmp_path):
     added = trimmed.modules[0].kind.parts[0].electronics_volume
     assert added == pytest.approx(0.2572 / WATER - 2.41516e-4)
     assert trim_neutral(trimmed, WATER).volume == pytest.approx(trimmed.volume)
+    # What the water does not lift is weight.
+    brick = "{type: FixedBrick, params: {buoyancy: 'off'}}"
+    dead = trim_neutral(read(tmp_path, f"body: {{type: Core, children: {{1: {brick}}}}}"), WATER)
+    assert (dead.volume - dead.modules[1].kind.volume) * WATER == pytest.approx(dead.mass)
     # Salt water carries more: the electronics shrink.
     salt = trim_neutral(trimmed, 1025.0)
     assert salt.volume * 1025.0 == pytest.approx(salt.mass)

@@ -69,6 +69,17 @@ def test_masses_and_centres_are_mujocos(name):
         np.testing.assert_allclose(apart / np.linalg.norm(apart), up, atol=1e-6)
 
 
+def test_what_modules_hold_is_told_apart_and_stands_where_it_must():
+    """Bricks of equal mass and volume, and sealed volume that moves the centre of all of it."""
+    brick = "{k}: {{type: FixedBrick, params: {{ballast: .01, ballast_position: [0, 0, {z}]}}}}"
+    bricks = (brick.format(k=k, z=z) for k, z in enumerate((-0.015, 0.01, -0.015)))
+    body = read(f"body: {{type: Core, children: {{{', '.join(bricks)}}}}}")
+    assert [len(some) for some in list_parts(body)] == [1, 2, 1]
+    robot = bench("{electronics_volume: 50.54e-6, center_of_volume: [0, .01, 0]}")
+    page = make_build_page(robot, "x")
+    assert "50.54 cm³ of sealed volume at (0, 20, 0) mm" in page
+
+
 def said(pattern, robot):
     [found] = re.findall(pattern, " ".join(ballast_words(weigh(robot))))
     return float(found)
