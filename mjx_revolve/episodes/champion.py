@@ -33,7 +33,7 @@ from mjx_revolve.episodes.run_reader import ChampionRecord, RunReader, find_run,
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.episodes.starts import draw_gusts, gusty_water
-from mjx_revolve.episodes.tasks import score_unit
+from mjx_revolve.episodes.tasks import COLONY_FITNESS, body_length, score_unit
 from mjx_revolve.inputs.commands import opening_episode
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import check_path
@@ -61,7 +61,7 @@ class Episode:
         genes: `[G]` or None without a controller.
         fitness: of the run, or None.
         folder: the run folder, or None.
-        starts: number of starts over which the score is the mean.
+        starts: those over which the score is the mean, in words.
     """
 
     title: str
@@ -76,6 +76,11 @@ class Episode:
     starts: str = "fresh starts"
 
     __repr__ = short_repr
+
+    @property
+    def length(self) -> float:
+        """Body length, as the run's task has it [m]."""
+        return body_length(self.robot, self.fitness.settings if self.fitness else None)
 
 
 def load_episode(
@@ -174,17 +179,28 @@ def _champion(champion: ChampionRecord, duration: float | None, seed: int | None
     return _episode(
         config, fitness.robot.morphology.title, fitness.robot, fitness.replay(champion.genes, key),
         water=fitness.water(key), score=champion.score, genes=champion.genes, fitness=fitness,
+        **({} if champion.is_final else _selected(config)),
     )  # fmt: skip
+
+
+def _selected(config: Config, born: int | None = None) -> dict[str, str]:
+    """The unit of a score by which an individual was selected, and over what it is the mean."""
+    if config.colony is not None:
+        return {"score_unit": COLONY_FITNESS, "starts": "its life"}
+    if config.bodies is not None and config.bodies.selection.reevaluate:
+        return {"starts": "all of its evaluations"}
+    own = "its own generation" if born is None else f"generation {born}"
+    return {"starts": f"{own}'s starts"}
 
 
 def _episode(
     config: Config, name: str, robot: Robot, trajectory: Trajectory, **more: Any
 ) -> Episode:
     """An episode of a run."""
+    facts = {"score_unit": score_unit(config.task.type, config.task.unit)} | more
     return Episode(
         f"{name}: {config.task.name.replace('_', ' ')}", robot, trajectory,
-        score_unit=score_unit(config.task.type, config.task.unit),
-        folder=Path(config.source).parent.absolute(), **more,
+        folder=Path(config.source).parent.absolute(), **facts,
     )  # fmt: skip
 
 
@@ -235,7 +251,7 @@ def _individual(path: Path, number: int, duration: float | None, seed: int | Non
     config, (life,) = read_individuals(path, [number], duration)
     fitness = fit_body(config, life.grow(read_modules(config)))
     key, genes = _key(config, seed), _own_genes(life, fitness.num_genes)
-    facts = _facts(life) | {"genes": genes, "water": fitness.water(key), "fitness": fitness}
+    facts = _facts(config, life) | {"genes": genes, "water": fitness.water(key), "fitness": fitness}
     return _episode(config, robot=fitness.robot, trajectory=fitness.replay(genes, key), **facts)
 
 
@@ -271,7 +287,9 @@ def load_individuals(
     water = fitness.water(key)
     found = zip(lives, robots, fitness.replay(robots, genes, key), genes, strict=True)
     return [
-        _episode(config, robot=robot, trajectory=swim, genes=own, water=water, **_facts(life))
+        _episode(
+            config, robot=robot, trajectory=swim, genes=own, water=water, **_facts(config, life)
+        )
         for life, robot, swim, own in found
     ]
 
@@ -285,12 +303,12 @@ def _own_genes(life: LoggedIndividual, count: int) -> np.ndarray:
     return genes
 
 
-def _facts(life: LoggedIndividual) -> dict[str, Any]:
+def _facts(config: Config, life: LoggedIndividual) -> dict[str, Any]:
     """The title, score and starts of an individual's episode."""
     return {
         "name": f"individual {life.number}, generation {life.born}",
         "score": None if math.isnan(life.score) else life.score,
-        "starts": f"generation {life.born}'s starts",
+        **_selected(config, life.born),
     }
 
 

@@ -296,6 +296,11 @@ class ChampionRecord:
         return float(score) if isinstance(score, int | float) else None
 
     @property
+    def is_final(self) -> bool:
+        """Whether its score is of fresh starts; of a run under way it is that of its selection."""
+        return self.facts.get("final", True) is True
+
+    @property
     def individual(self) -> int:
         """Its number among the individuals of a run in which bodies evolved."""
         found = self.facts.get("individual")

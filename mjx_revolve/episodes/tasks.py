@@ -17,7 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.engine.plant import BodyGeometry
+from mjx_revolve.engine.plant import BodyGeometry, body_geometry
+from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.measure_table import records_of
 from mjx_revolve.inputs.errors import InputError
@@ -344,13 +345,13 @@ def hold_heading(track: Track, settings: TaskConfig) -> jax.Array:
 
 
 def follow_bed(track: Track, settings: Any) -> jax.Array:
-    """Progress along a direction while the core keeps its height above the bed [body lengths/s]."""
+    """Progress along a direction while the robot keeps a height above the bed [body lengths/s]."""
     height = track.clearance - settings.height
     return crawl(replace(track, clearance=height), settings)
 
 
 def crawl(track: Track, settings: TaskConfig) -> jax.Array:
-    """Progress along a direction while the core stays near the bed [body lengths/s]."""
+    """Progress along a direction while the robot stays near the bed [body lengths/s]."""
     along = _along(jnp.swapaxes(jnp.diff(track.position, axis=0), 0, 1), settings)
     middle = (track.clearance[1:] + track.clearance[:-1]) / 2
     return _progress(track, along, along * _keeping(middle, settings.depth_tolerance))
@@ -484,6 +485,17 @@ def _find_task(name: str) -> Task | None:
         return TASKS[name] if name in TASKS else _load_task(name, "task.type")
     except InputError:
         return None
+
+
+def body_length(robot: Robot, settings: TaskConfig | None) -> float:
+    """Body length in which a task counts; without a task, that at rest [m]."""
+    if settings is None or settings.length == "rest":
+        return robot.morphology.length
+    return float(body_geometry(robot).stretched)
+
+
+COLONY_FITNESS = "fitness in the colony"
+"""What stands where the unit of a colony's own scores would."""
 
 
 def score_unit(name: str, unit: str = "body_lengths") -> str:

@@ -362,6 +362,7 @@ class Run:
         best = self.evolution.best(self.search)
         if best is None:
             return
+        (self.folder.path / PASSPORT).unlink(missing_ok=True)  # an older champion's
         number = {} if best.individual is None else {"individual": best.individual}
         origin = f"{best.origin}, not yet evaluated on fresh starts"
         self.folder.save_champion(
@@ -410,8 +411,6 @@ class Run:
                 _log.warning("the champion has no passport: %s", error)
         if champion.passport is not None:
             self.folder.write(PASSPORT, champion.passport.to_text().encode())
-        else:  # an older champion's
-            (self.folder.path / PASSPORT).unlink(missing_ok=True)
         return champion
 
     def close(self) -> None:

@@ -84,6 +84,7 @@ def episode_data(episode: Episode, forces: bool = True) -> Packed:
         "many": False,
         "episode": {
             "step": step,
+            "length": episode.length,
             # Direction of the way, from x towards y [deg]; a robot that stays is shown along y.
             "heading": math.degrees(math.atan2(net[1], net[0]))
             if float(np.linalg.norm(net)) > 0.05 * length

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mjx_revolve.engine.kinematics import mass_centers
-from mjx_revolve.engine.plant import body_geometry
+from mjx_revolve.episodes.tasks import body_length
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.short_repr import short_repr
 from mjx_revolve.view.surroundings import water_velocity
@@ -139,9 +139,7 @@ def analyse_motion(
         raise InputError("trajectory.qpos: expected finite numbers in its first row; found none")
     columns = (trajectory.time, trajectory.qpos, trajectory.ctrl, trajectory.power)
     time, qpos, ctrl, power = (np.asarray(column, float)[:count] for column in columns)
-    length = robot.morphology.length
-    if task is not None and task.length == "stretched":
-        length = body_geometry(robot).stretched
+    length = body_length(robot, task)
     weight = robot.morphology.mass * max(robot.world.gravity, 1e-9)
     own = trajectory.surface_height
     surface = np.full(count, robot.world.surface_height) if own is None else np.array(own)[:count]

@@ -36,18 +36,21 @@ class SensorTrace(NamedTuple):
         given: `[T, parts, rows]` input of the controller before each step, in the sensor's unit.
         true: `[T, parts, rows]` true value at that time; infinite if there is none, as without a
             bed.
+        rate: of the values given: the sensor's own, or that of the controller's commands, between
+            which they are held; None: new ones in each step [Hz].
     """
 
     sensor: Sensor
     rows: tuple[str, ...]
     given: np.ndarray
     true: np.ndarray
+    rate: float | None
 
     @property
     def is_exact(self) -> bool:
         """Whether the values given are the true ones, but for the range."""
         own = self.sensor
-        return own.noise == 0 and own.rate is None and own.delay == 0
+        return own.noise == 0 and self.rate is None and own.delay == 0
 
 
 def trace_sensors(
@@ -109,7 +112,8 @@ def trace_sensors(
             names, a, b = tuple(names[k] for k in kept), a[..., kept], b[..., kept]
         zero, scale = sensor.scaling
         if names:
-            traces.append(SensorTrace(sensor, names, a / scale + zero, b))
+            rate = sensor.rate or fitness.controller.rate
+            traces.append(SensorTrace(sensor, names, a / scale + zero, b, rate))
     return tuple(traces)
 
 

@@ -73,7 +73,7 @@ def _unit(trace: SensorTrace) -> str:
 def _draw_curves(axes: Axes, time: np.ndarray, trace: SensorTrace) -> None:
     """Readings of a sensor of the whole robot."""
     rows, sensor, parts = thin(len(time), _POINTS), trace.sensor, trace.sensor.kind.parts
-    style = "default" if sensor.rate is None else "steps-post"
+    style = "default" if trace.rate is None else "steps-post"
     for k in range(trace.given.shape[1]):
         given, true, color = trace.given[rows, k, 0], trace.true[rows, k, 0], COLORS[k]
         if not trace.is_exact:

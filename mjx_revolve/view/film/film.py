@@ -46,6 +46,7 @@ class EpisodeNotes:
 
     Attributes:
         score: a line below the title.
+        length: body length, as the task has it [m].
         way: `[F, 3]` of the robot without the to and fro of its strokes, world frame [m].
         radius: `[F]` of balls around the robot [m].
         speed: `[F]` of the core, over a stroke or a second around each frame [m/s].
@@ -54,6 +55,7 @@ class EpisodeNotes:
     """
 
     score: str
+    length: float
     way: np.ndarray
     radius: np.ndarray
     speed: np.ndarray
@@ -158,8 +160,8 @@ def make_film(episode: Episode, size: tuple[int, int] = (640, 480), fps: int = 3
     if target is not None:
         target = np.stack([np.interp(time, rows, x) for x in target[: len(rows)].T], axis=-1)
     notes = EpisodeNotes(
-        score, smooth_path(time, center, period), radius, speed_over(time, qpos[:, :3], period),
-        water_velocity(world, water, center), target,
+        score, episode.length, smooth_path(time, center, period), radius,
+        speed_over(time, qpos[:, :3], period), water_velocity(world, water, center), target,
     )  # fmt: skip
     shown = FilmRobot(robot, qpos, np.ones(len(time), bool))
     origin = (center.min(axis=0) + center.max(axis=0)) / 2

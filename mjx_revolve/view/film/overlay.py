@@ -204,6 +204,7 @@ class Pen:
 
     def title(self, words: str) -> None:
         """At the top, as much as there is room for."""
+        words = " ".join(words.split())  # an id may have line breaks
         room, full = self.width - 2 * self.edge, words
         while words and self.bold.getlength(words if words == full else words + "…") > room:
             words = words[:-1]
@@ -311,7 +312,7 @@ def _facts(film: Film, notes: EpisodeNotes, frame: int, below: str) -> list[str]
     depth = float(np.asarray(film.water.surface_height)[frame] - film.center[frame, 2])
     facts = [
         f"{speed:.2f} m/s" if speed >= 0.1 else f"{100 * speed:.1f} cm/s",
-        f"{speed / film.robots[0].robot.morphology.length:.2f} body lengths/s",
+        f"{speed / notes.length:.2f} body lengths/s",
         f"depth {depth:.2f} m" if depth >= -0.005 else f"{-depth:.2f} m above the water",
     ]
     return [*facts, below] if below else facts

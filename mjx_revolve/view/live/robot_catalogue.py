@@ -19,7 +19,7 @@ from mjx_revolve.episodes.fitness import MixedFitness, make_mixed_fitness
 from mjx_revolve.episodes.individual_log import INDIVIDUALS, read_individuals
 from mjx_revolve.episodes.named_files import read_modules, read_world
 from mjx_revolve.episodes.run_reader import RunReader, find_run
-from mjx_revolve.episodes.tasks import score_unit
+from mjx_revolve.episodes.tasks import COLONY_FITNESS, score_unit
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.shipped import find_shipped, list_shipped
 from mjx_revolve.inputs.yaml_reader import load_yaml
@@ -182,10 +182,14 @@ def _read_config(path: str) -> Config:
 
 
 def _bodies(config: Config, water: World, path: Path, group: str = "") -> list[_Draft]:
-    """A morphology with random genes, and the same without a controller."""
+    """A morphology with random genes, and the same without a controller.
+
+    It is trimmed if the configuration says so; so are shipped robots that stand beside.
+    """
     morphology = load_morphology(path, read_modules(config), config.allow_overlap)
     with suppress(InputError):  # a robot that floats stays as it is
-        morphology = trim_neutral(morphology, water.density)
+        if group == "shipped" or config.trim == "neutral":
+            morphology = trim_neutral(morphology, water.density)
     name = path.stem
     group = group or name
     drafts = [_Draft(f"{name}, still", name, group, morphology, lambda _: None)]
@@ -200,11 +204,13 @@ def _bodies(config: Config, water: World, path: Path, group: str = "") -> list[_
 def _run_drafts(own: Config, water: World, folder: Path) -> list[_Draft]:
     """A run's champion, and, where bodies evolve, its best individuals."""
     unit, group = score_unit(own.task.type, own.task.unit), folder.absolute().name
+    selected = unit if own.colony is None else COLONY_FITNESS
     run, drafts = RunReader(find_run(folder)), []
     if run.champion_path is not None:
         champion = run.load_champion()
         score = champion.score
-        words = "" if score is None else f": {score:.3g} {unit}"
+        own_unit = unit if champion.is_final else selected
+        words = "" if score is None else f": {score:.3g} {own_unit}"
         named = champion.load_config().morphology
         assert named is not None
         body = load_morphology(named, read_modules(own), allow_overlap=True)
@@ -218,7 +224,7 @@ def _run_drafts(own: Config, water: World, folder: Path) -> list[_Draft]:
         for life in sorted(scored, key=rank)[:_MOST_INDIVIDUALS]:
             short = f"individual {life.number}"
             body = _trimmed(own, life.grow(read_modules(own)), water)
-            name = f"{short}: {life.score:.3g} {unit}"
+            name = f"{short}: {life.score:.3g} {selected}"
             drafts.append(_Draft(name, short, group, body, _known(life.genes, short)))
     if not drafts:
         raise InputError(f"{folder}: expected a champion or individuals; found none yet")

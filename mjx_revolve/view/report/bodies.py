@@ -10,6 +10,7 @@ import shlex
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
+from urllib.parse import quote
 
 import numpy as np
 from PIL import Image
@@ -160,7 +161,7 @@ def _page(record: RunRecord, life: LoggedIndividual, at: Path) -> str:
     path = record.folder / PAGE_FOLDER / f"{life.number}.html"
     if not path.is_file():
         return ""
-    return Path(os.path.relpath(path, at.absolute())).as_posix()
+    return quote(Path(os.path.relpath(path, at.absolute())).as_posix())
 
 
 # --- the archive ----------------------------------------------------------------------------------
@@ -172,7 +173,7 @@ def _named(record: RunRecord) -> tuple[str, ...]:
     if bodies is None:
         return ()
     selection = bodies.selection
-    names = [name.lstrip("-") for name in (*selection.objectives, *selection.novelty)]
+    names = [name.removeprefix("-") for name in (*selection.objectives, *selection.novelty)]
     names += bodies.archive.axes if bodies.archive is not None else ()
     return tuple(dict.fromkeys(name for name in names if name not in ("score", "novelty")))
 

@@ -83,7 +83,9 @@ def _of_seeds(group: RunGroup, unit: str) -> list[tuple[str, str]]:
     if scores := group.scores():
         pairs = [(str(interval(scores)), f"mean score{unit}, 95 % interval"),
                  (format_number(max(scores)), f"best score{unit}")]  # fmt: skip
-    return [*pairs, (str(len(group.records)), "seeds")]
+    count = str(len(group.records))
+    done = count if len(scores) == len(group.records) else f"{len(scores)} of {count}"
+    return [*pairs, (done, "seeds" if done == count else "seeds are finished")]
 
 
 def _of_run(record: RunRecord, unit: str) -> list[tuple[str, str]]:

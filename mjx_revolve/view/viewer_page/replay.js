@@ -33,6 +33,7 @@ class EpisodeParts {
     Object.assign(this, { page, stage, size, begin, world, center, drift, target, place: new THREE.Vector3() });
     this.speed = track(episode.speed, 1);
     this.deepest = episode.deepest;
+    this.length = episode.length;
     this.speedName = episode.current ? "speed over ground" : "speed";
     page.heading = episode.heading;
     const [robot] = page.robots.there.values();
@@ -83,7 +84,7 @@ class EpisodeParts {
     const facts = {
       time: `${time.toFixed(2)} s`,
       [this.speedName]: {
-        text: `${v.toFixed(3)} m/s`, more: `${(v / this.size).toFixed(2)} body lengths/s`,
+        text: `${v.toFixed(3)} m/s`, more: `${(v / this.length).toFixed(2)} body lengths/s`,
         title: "over ground, mean over one stroke",
       },
       depth: { text: `${depth.toFixed(2)} m`, title: "of the core's centre below the still surface" },
