@@ -49,6 +49,12 @@ out has the value under "usual". `task.robust`, `bodies`, `bodies.archive`, `col
 says what was expected.
 """
 
+_FAILED = """Frames are those of `docs/glossary.md`; heights are those of the robot's `point`.
+
+A rollout that is no longer finite counts as blown up, with a score of -1000; so does one that gets
+farther from its start than √(9 + F) m/s (F the thrusters' newtons), the fall of what sinks and the
+water's own velocity can carry it (currents, shear, field and gusts; waves go round)."""
+
 
 def meanings(kind: type) -> dict[str, str]:
     """What each field means: the docstring behind it, or its line under `Attributes`."""
@@ -142,6 +148,7 @@ def make_page() -> str:
         needs = [f"`{x}`" for x in settings.TASKS[name]] + ["a world with a bed"] * task.on_bed
         said = re.sub(r" \[[^\]]+\].$", "", first_paragraph(task.score))
         lines.append(f"| `{name}` | {said} | {task.unit} | {', '.join(needs)} |")
+    lines += ["", *_FAILED.split("\n")]
     lines += [
         "",
         "## Controllers",

@@ -45,7 +45,7 @@ def make_feedback(body: Plant | Robot, depth: float = 1.0, gain: float = 2.0) ->
     Args:
         body: a plant or a robot.
         depth: to hold, of the core's centre below the still surface [m].
-        gain: share of the range that a feature of size 1 may command at most [-].
+        gain: share of half the range that a feature of size 1 may command at most [-].
 
     Returns:
         The controller; genes: a bias per actuator, then the gains, actuator by actuator.

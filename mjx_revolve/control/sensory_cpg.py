@@ -58,7 +58,8 @@ def make_sensory_cpg(
         sensors: of the feedback; by default `DEFAULT_SENSORS`.
         max_frequency: upper end of f [Hz].
         amplitude: share of the ranges used [-].
-        gain: largest response to a sensor at the end of its range, as a share of the range [-].
+        gain: largest response to a sensor at the end of its range, as a share of half the hinge's
+            range [-].
 
     Returns:
         The controller; genes: A, B, then P, R and O of each sense, per hinge; φ per pair; f; B and

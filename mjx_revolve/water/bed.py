@@ -34,8 +34,7 @@ class Bed:
         height: height of the plane, or of the lake's deepest place, world frame [m].
         highest: height of the lake's shore [m]; unused by "flat".
         extent: side of the square that is drawn and that "lake" is shaped in [m].
-        stiffness: largest stiffness of one contact point [N/m]; the step uses less where the
-            body is too light for it to be stable (see `contact`).
+        stiffness: of one contact point, for bodies of any mass: the spring is implicit [N/m].
         friction: Coulomb coefficient [-].
         contact: what keeps robots out of it: "penalty" (see `contact.bed_contact`), or "mjx", the
             modules' boxes by MuJoCo's constraint solver (see `engine.mjx_engine`), which needs

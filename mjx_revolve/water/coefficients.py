@@ -36,7 +36,7 @@ _SWIMMERS = "hydro.c of EPFL's chains, and FARMS"
 _LIGHTHILL = "Lighthill, 1971"
 _POREZ = "Porez, Boyer and Ijspeert, 2014"
 _IKEDA = "Ikeda's bilge keels, ITTC's recommended procedure for roll damping"
-_WAGNER = "two exponentials fitted to Wagner's function"
+_WAGNER = "R. T. Jones's two exponentials, fitted to Wagner's function"
 
 TODAY: dict[str, Sourced] = {
     "cube_drag": Sourced(

@@ -83,7 +83,7 @@ class Wave:
         wavelength: from crest to crest [m]; or instead
         period: from crest to crest, felt by what drifts with the uniform current [s].
         direction: towards which it runs, from world x towards y [rad].
-        phase: φ, at the world's origin at time 0 [rad].
+        phase: φ, at the world's origin at time 0 [rad]. Episodes of tasks begin at random times.
     """
 
     amplitude: Annotated[NonNegative, Unit("m")]

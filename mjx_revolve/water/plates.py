@@ -125,8 +125,9 @@ class Fossen:
     box of them acts.
 
     Attributes:
-        added_mass: M [kg, kg·m, kg·m²].
-        linear_damping: D [N·s/m, N·s, N·m·s].
+        added_mass: M, about the centre of the part's main box, in the part's axes (z up), surge,
+            sway, heave, roll, pitch and yaw in this order; positive [kg, kg·m, kg·m²].
+        linear_damping: D, of the same point and axes [N·s/m, N·s, N·m·s]. It is symmetric.
         quadratic_damping: d, six numbers >= 0 [N·s²/m², N·m·s²].
         whole: whether they are those of the whole robot, of which the part is the core: the water
             then neither drags nor is carried by any other part. For robots without hinges.
