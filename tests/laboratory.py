@@ -204,16 +204,7 @@ def read(text: str) -> Morphology:
 
 
 def swimmer(folder: Path, robot: str, task: dict[str, Any]) -> dict[str, Any]:
-    """A configuration: a robot that hovers in the lake, and sines that drive it.
-
-    Args:
-        folder: where the robot's file is written.
-        robot: the text of its YAML.
-        task: its settings.
-
-    Returns:
-        What `make_fitness` takes.
-    """
+    """What `make_fitness` takes: a robot, written to a folder, that hovers in the lake; sines."""
     return {
         "morphology": str(write(folder, robot)),
         "world": "lake",
@@ -224,13 +215,7 @@ def swimmer(folder: Path, robot: str, task: dict[str, Any]) -> dict[str, Any]:
 
 
 def make_track(position: Any, interval: float = 1.0, **more: Any) -> Track:
-    """A track of one individual, half a metre long.
-
-    Args:
-        position: `[S, 3]` [m].
-        interval: between rows [s].
-        more: other records, `[S]` or `[S, n]`; these and the position get a lane.
-    """
+    """A track of one individual, half a metre long: `position` `[S, 3]` and others get a lane."""
     ones = np.ones(len(position))
     lanes = {"position": position, "clearance": ones, "energy": ones} | more
     return Track(

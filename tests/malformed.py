@@ -195,12 +195,7 @@ def _misspell(draw: Callable, name: str) -> str:
 
 @st.composite
 def mutants(draw: Callable, *texts: str) -> Mutant:
-    """Valid files in which one to three things are wrong, or may be.
-
-    Args:
-        draw: hypothesis's own.
-        *texts: of the valid files, YAML.
-    """
+    """Valid files in which one to three things are wrong, or may be."""
     before = yaml.safe_load(draw(st.sampled_from(texts)))
     tree = _to_pairs(copy.deepcopy(before))
     count = draw(st.sampled_from([1, 1, 1, 2, 3]))
@@ -245,12 +240,7 @@ def mutants(draw: Callable, *texts: str) -> Mutant:
 
 @st.composite
 def wrecks(draw: Callable, *contents: bytes) -> Mutant:
-    """Files with bits flipped, cut short, with something in their midst, or of something else.
-
-    Args:
-        draw: hypothesis's own.
-        *contents: of the valid files.
-    """
+    """Files with bits flipped, cut short, with something in their midst, or of something else."""
     content = bytearray(draw(st.sampled_from(contents)))
     how = draw(st.sampled_from(["flip", "cut", "insert", "splice", "other"]))
     size = len(content)
@@ -342,11 +332,7 @@ _hooked: list[bool] = []  # there is no taking it away again
 
 @contextlib.contextmanager
 def watching(*folders: str | Path) -> Iterator[None]:
-    """Has no file read or written outside of some folders and the program's own; runs nothing.
-
-    Args:
-        folders: in which anything may be done.
-    """
+    """Has no file read or written outside of some folders and the program's own; runs nothing."""
     if not _hooked:
         sys.addaudithook(_watch)
         _hooked.append(True)
@@ -362,12 +348,7 @@ def watching(*folders: str | Path) -> Iterator[None]:
 
 
 def check_message(message: str, *places: str | Path) -> None:
-    """A message is one printable line of bounded length, with place, expected and found.
-
-    Args:
-        message: as it is shown, without a line's end.
-        *places: one of which it begins with.
-    """
+    """A message is one printable line of bounded length: one of the places, expected and found."""
     assert message.isprintable(), message
     assert len(message) <= _LONGEST, message
     assert message.startswith(tuple(map(str, places))), message
@@ -375,16 +356,7 @@ def check_message(message: str, *places: str | Path) -> None:
 
 
 def read_file(read: Callable[[], Any], folder: Path, *places: str | Path) -> Any:
-    """Has a file read, twice where that goes well.
-
-    Args:
-        read: reads it.
-        folder: where it is.
-        *places: with one of which messages begin.
-
-    Returns:
-        What was read; an `InputError`, whose message is as it should be, where it was refused.
-    """
+    """Has a file in a folder read, twice where that goes well: what it holds, or `InputError`."""
     with watching(folder):
         try:
             found = read()
@@ -404,17 +376,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 def run_main(main: Callable, argv: list[str], folder: Path, *places: str | Path) -> int:
-    """Runs a command in this process.
-
-    Args:
-        main: its entry function.
-        argv: its arguments.
-        folder: where its files are.
-        *places: with one of which messages begin.
-
-    Returns:
-        Its exit code: 0 also where it is `Accepted`. With 2 there is one line, as it should be.
-    """
+    """Runs a command here; its exit code, 0 also where it is `Accepted`; with 2, one line."""
     out, err = io.StringIO(), io.StringIO()
     with watching(folder), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:

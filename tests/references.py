@@ -48,16 +48,7 @@ def _tetrahedron_below(corners, height):
 
 
 def clip_box(up, depth, half):
-    """Submerged share of a box and its moment, by cutting it into tetrahedra.
-
-    Args:
-        up: `[3]` unit vertical, box frame.
-        depth: of the box's centre below the surface.
-        half: `[3]` half edges.
-
-    Returns:
-        share of the volume under water, and share times centre of the piece, box frame.
-    """
+    """Submerged share of a box, and that times the piece's centre, by tetrahedra."""
     up, half = np.asarray(up, float), np.asarray(half, float)
     volume, moment = 0.0, np.zeros(3)
     for tetrahedron in _KUHN:
