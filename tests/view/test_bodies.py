@@ -185,13 +185,13 @@ def test_cells_of_the_archive_are_links(tmp_path, still):
     (run / "individuals" / "3.html").write_text("")
     page = report_page.make_report([record], at=tmp_path / "elsewhere")
     assert set(re.findall(r'xlink:href="([^"]*html|#individual[^"]*)"', page)) == {
-        "../a b/individuals/3.html", f"#{report_bodies.anchor(record, 4)}",
+        "../a%20b/individuals/3.html", f"#{report_bodies.anchor(record, 4)}",
         f"#{report_bodies.anchor(record, 5)}",
     }  # fmt: skip
     for number in (3, 4, 5):
         assert f'id="{report_bodies.anchor(record, number)}"' in page
     assert "--individual 4" in page and "&#39;" in page  # a name with a blank is quoted
-    assert '<a href="../a b/individuals/3.html">#3</a>' in page
+    assert '<a href="../a%20b/individuals/3.html">#3</a>' in page
     assert "<?xml" not in page and page.count("<svg") == 1
 
 
