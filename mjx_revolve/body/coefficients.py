@@ -92,13 +92,12 @@ def correct_modules(tree: tuple[Module, ...], entries: Entries, source: str) -> 
 
 
 def _correct(module: Module, entries: Entries, source: str) -> Module:
-    kind, params = module.kind, dict(module.params)
+    kind, params = module.base or module.kind, dict(module.params)
     # A module may be named after its type.
     for name in dict.fromkeys((ALL, module.type, *kind.aliases, module.name)):
         entry = _suited(entries.get(name, {}), kind)
         if not entry:
             continue
-        kind = apply_overrides(kind, entry)
         before, more = params.get("factors", {}), entry.get("factors", {})
         ballast = params.get("ballast", 0.0)
         if ballast and "ballast" in entry and "ballast_position" in params | entry:
@@ -112,7 +111,10 @@ def _correct(module: Module, entries: Entries, source: str) -> Module:
         if before or more:
             both = {k: multiply_factors(x, before.get(k, 1.0)) for k, x in more.items()}
             params["factors"] = before | both
-    return replace(module, kind=kind, params=params)
+    if params == module.params:
+        return module
+    # Of the type and all params at once, as the saved robot is read.
+    return replace(module, kind=apply_overrides(kind, params), params=params, base=kind)
 
 
 def _suited(entry: Mapping[str, object], kind: ModuleType) -> dict[str, Any]:

@@ -255,6 +255,7 @@ def read_module(
         rotation=rotation,
         kind=changed,
         params=params,
+        base=kind,
     )
 
 

@@ -35,6 +35,7 @@ class Module:
         rotation: `[3, 3]` core frame from module frame.
         kind: its type, with the file's `params` (mass, volume, ...) applied.
         params: the file's `params` without the colour.
+        base: its type without `params`, where it has some; not compared.
         origin: of a module that edits have copied: of which parent (0: the edited body itself), and
             its name there. Neither compared nor saved.
     """
@@ -49,6 +50,7 @@ class Module:
     rotation: np.ndarray
     kind: ModuleType
     params: Mapping[str, Any] = field(default_factory=dict)
+    base: ModuleType | None = None
     origin: tuple[int, str] | None = None
 
     def __eq__(self, other: object) -> bool:

@@ -69,12 +69,13 @@ class Morphology:
 
     def __reduce__(self) -> Any:
         """Pickles small and quickly for other processes: the catalogue's types by name."""
-        kinds = {id(module.kind): module.kind for module in self.modules}
+        kinds = {id(kind): kind for m in self.modules for kind in (m.kind, m.base or m.kind)}
         number = {key: k for k, key in enumerate(kinds)}
         rows = [
-            (m.name, m.type, m.parent, m.slot, m.orientation, m.rgb, number[id(m.kind)], m.params)
+            (m.name, m.type, m.parent, m.slot, m.orientation, m.rgb, number[id(m.kind)], m.params,
+             number[id(m.base or m.kind)])
             for m in self.modules
-        ]
+        ]  # fmt: skip
         named = [k.name if MODULES.get(k.name) is k else k for k in kinds.values()]
         place = np.concatenate([x for m in self.modules for x in (m.position, *m.rotation)])
         head = (self.name, self.brain, self.path, self.overlaps, self.sensors)
@@ -260,8 +261,10 @@ def _unpack(
     kinds = [MODULES[kind] if isinstance(kind, str) else kind for kind in named]
     places = np.frombuffer(place).reshape(-1, 4, 3)
     modules = [
-        Module(own, type, parent, slot, turn, rgb, at[0], at[1:], kinds[kind], params)
-        for (own, type, parent, slot, turn, rgb, kind, params), at in zip(rows, places, strict=True)
+        Module(own, type, parent, slot, turn, rgb, at[0], at[1:], kinds[kind], params, kinds[base])
+        for (own, type, parent, slot, turn, rgb, kind, params, base), at in zip(
+            rows, places, strict=True
+        )
     ]
     return Morphology(name, tuple(modules), brain, path, overlaps, sensors)
 

@@ -236,6 +236,14 @@ def test_fitted_coefficients_count_once_and_come_back_from_a_file(tmp_path):
             assert ".." not in place
             (tmp_path / place).write_bytes(content)
         assert load_morphology(tmp_path / path.name).mass == robot.mass
+    # Whatever of its mass a module has of its own, the saved robot is the one that was read.
+    for own, entry in (("factors: {mass: 2}", "ballast: 0.01"), ("ballast: 0.02", "mass: 0.05")):
+        (tmp_path / "own.yaml").write_text(f"modules: {{all: {{{entry}}}}}")
+        text = f"coefficients: own.yaml\nbody: {{type: Core, params: {{{own}}}}}"
+        robot = read(tmp_path, text)
+        again = pickle.loads(pickle.dumps(robot))
+        assert robot == make_morphology(robot.to_mapping() | {"id": robot.name})
+        assert again.modules[0].base == MODULES["Core"] and again == robot
 
 
 def test_ballast_without_a_place_is_spread_and_with_one_is_a_point(tmp_path):
