@@ -165,6 +165,11 @@ class Part:
         return max(self.boxes[0].volume - self.total_volume, 0.0)
 
     @property
+    def lifted_volume(self) -> float:
+        """Volume by which the water lifts it: `total_volume`, or 0 with buoyancy off [m³]."""
+        return 0.0 if self.buoyancy == "off" else self.total_volume
+
+    @property
     def displaced_center(self) -> Vector:
         """Centre of the displaced volume: mesh, electronics and ballast, part frame [m]."""
         whole = self.total_volume

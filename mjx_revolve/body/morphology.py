@@ -429,7 +429,7 @@ def trim_neutral(morphology: Morphology, density: float) -> Morphology:
             "trimmed by its volume; found buoyancy off"
         )
     parts = [part for module in morphology.modules for part in module.kind.parts]
-    dead = sum(part.total_volume for part in parts if part.buoyancy == "off")
+    dead = sum(part.total_volume - part.lifted_volume for part in parts)
     inside = sum(part.electronics_volume for part in core.kind.parts)
     total = morphology.mass / density - (morphology.volume - dead - inside)
     if total < -1e-9 * morphology.volume:  # neutral to rounding counts as neutral

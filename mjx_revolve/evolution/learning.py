@@ -179,14 +179,19 @@ def evaluate_again(
         if np.isnan(scores[0]):
             continue
         count = one.evaluations + 1
-
-        def mean(old: float, new: float, share: float = 1 / count) -> float:
-            return (1 - share) * old + share * new if share < 1 else new
-
-        score = np.nan if np.isneginf(scores[0]) else mean(one.score, float(scores[0]))
-        found = {name: mean(x, float(measures[name][0])) for name, x in one.measures.items()}
-        means[one.number] = replace(one, score=score, measures=found, evaluations=count)
+        mean = {
+            name: _add_to_mean(x, float(measures[name][0]), count)
+            for name, x in one.measures.items()
+        }
+        blew_up = np.isneginf(scores[0])
+        score = np.nan if blew_up else _add_to_mean(one.score, float(scores[0]), count)
+        means[one.number] = replace(one, score=score, measures=mean, evaluations=count)
     return [means.get(one.number, one) for one in individuals]
+
+
+def _add_to_mean(mean: float, value: float, count: int) -> float:
+    """The mean of `count` values, from that of all but the last; of one, the value itself."""
+    return value if count == 1 else (1 - 1 / count) * mean + 1 / count * value
 
 
 def learnt_genes(fitness: BodyFitness, individual: Individual) -> np.ndarray:

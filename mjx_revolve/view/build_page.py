@@ -100,12 +100,11 @@ def list_parts(body: Morphology) -> list[list[Module]]:
     """The modules by type; those with masses or volumes of their own count as types."""
     kinds: list[list[Module]] = []
     for module in body.modules:
-        same = (found for found in kinds if found[0].type == module.type)
-        group = next((found for found in same if found[0].kind == module.kind), None)
+        key = module.type, module.kind
+        group = next((some for some in kinds if (some[0].type, some[0].kind) == key), None)
         if group is None:
-            kinds.append([module])
-        else:
-            group.append(module)
+            kinds.append(group := [])
+        group.append(module)
     return kinds
 
 
@@ -134,11 +133,6 @@ def _describe(kind: ModuleType, part: Part) -> str:
     return ", ".join(words)
 
 
-def _lifting(part: Part) -> float:
-    """The volume by which the water lifts a part [m³]."""
-    return 0.0 if part.buoyancy == "off" else part.total_volume
-
-
 def weigh(robot: Robot) -> Balance:
     """Mass, displaced volume and their centres, the robot at rest."""
     body, density = robot.morphology, robot.world.density
@@ -148,11 +142,11 @@ def weigh(robot: Robot) -> Balance:
         for part in module.kind.parts:
             for total, center, sums in (
                 (part.total_mass, part.center_of_mass, weighed),
-                (_lifting(part), part.displaced_center, lifted),
+                (part.lifted_volume, part.displaced_center, lifted),
             ):
                 local = np.add(part.position, center)
                 sums += total * (module.position + module.rotation @ local)
-            mass, volume = mass + part.total_mass, volume + _lifting(part)
+            mass, volume = mass + part.total_mass, volume + part.lifted_volume
             sealed += part.electronics_volume + part.ballast_volume
     return Balance(
         mass=1e3 * mass,
