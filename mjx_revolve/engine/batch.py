@@ -297,6 +297,8 @@ def fit_capacity(
     columns, world = read_constants(assembly, meeting), robots[0].world
     carries = columns.parts.carried is not None
     sizes = _sizes(assembly, columns)
+    if modules and isinstance(find_drag_law(world.drag), BodyDragLaw):  # no part may overflow
+        sizes = _widest_bodies(assembly, columns, sizes, modules)
     types = {m.kind.name: m.kind for r in robots for m in r.morphology.modules}
     types |= {kind.name: kind for kind in kinds}
     # Nothing acts on what neither floats nor drags nor carries nor pushes.
@@ -393,6 +395,23 @@ def _choose_groups(
                 best = (cost, groups, order)
     assert best is not None
     return best[1], best[2]
+
+
+def _widest_bodies(
+    assembly: Assembly, columns: StepConstants, sizes: _Sizes, modules: int
+) -> _Sizes:
+    """Sizes with room for the most parts on one body of the robots' types of modules."""
+    module, nbody = assembly.layout.module, len(assembly.parent)
+    is_core = np.array([m.parent < 0 for body in assembly.morphologies for m in body.modules])
+    parts, root_parts = {}, {}
+    for k, laws in enumerate(columns.laws):
+        held = columns.part_laws == k
+        where, count = np.unique(module[held] * nbody + columns.part_body[held], return_counts=True)
+        core = is_core[where // nbody]
+        most = (modules - 1) * count[~core].max(initial=0)
+        parts[laws] = np.maximum(sizes.parts[laws], most)
+        root_parts[laws] = np.maximum(sizes.root_parts[laws], most + count[core].max(initial=0))
+    return sizes._replace(parts=parts, root_parts=root_parts)
 
 
 def _most_rows(

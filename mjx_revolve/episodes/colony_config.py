@@ -135,7 +135,18 @@ class ColonyConfig(Settings):
         if 2 * self.birth.radius > self.arena.size:
             wide = f"at most half of the arena's size ({self.arena.size / 2:g} m)"
             raise ConstraintError("birth.radius", wide, f"{self.birth.radius:g}")
-        if self.energy is not None and self.energy.start > self.energy.capacity:
-            most = f"at most the capacity ({self.energy.capacity:g} J)"
-            raise ConstraintError("energy.start", most, f"{self.energy.start:g}")
+        if self.life.window > self.life.max_age:
+            most = f"at most life.max_age ({self.life.max_age:g} s), or fitness is never measured"
+            raise ConstraintError("life.window", most, f"{self.life.window:g}")
+        if self.energy is not None:
+            self._check_energy(self.energy)
         return self
+
+    def _check_energy(self, energy: EnergyConfig) -> None:
+        if energy.start > energy.capacity:
+            most = f"at most the capacity ({energy.capacity:g} J)"
+            raise ConstraintError("energy.start", most, f"{energy.start:g}")
+        for k, (x, y, _) in enumerate(energy.chargers):
+            if max(abs(x), abs(y)) > self.arena.size / 2:
+                inside = f"a place in the arena (x and y within {self.arena.size / 2:g} m)"
+                raise ConstraintError(f"energy.chargers[{k}]", inside, f"{x:g}, {y:g}")

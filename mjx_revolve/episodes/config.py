@@ -473,9 +473,16 @@ class Config(Settings):
         if self.bodies.archive is not None:
             raise ConstraintError("bodies.archive", "none, as there is a colony", "one")
         assert self.colony is not None
-        if self.colony.birth.initial > self.evolution.population_size:
+        initial, seeds = self.colony.birth.initial, len(self.bodies.seeds)
+        if initial > self.evolution.population_size:
             most = f"at most evolution.population_size ({self.evolution.population_size})"
-            raise ConstraintError("colony.birth.initial", most, str(self.colony.birth.initial))
+            raise ConstraintError("colony.birth.initial", most, str(initial))
+        if initial < seeds:
+            least = f"at least as many as bodies.seeds ({seeds})"
+            raise ConstraintError("colony.birth.initial", least, str(initial))
+        if self.colony.arena.depth <= self.task.depth:
+            least = f"more than task.depth ({self.task.depth:g} m), at which robots are born"
+            raise ConstraintError("colony.arena.depth", least, f"{self.colony.arena.depth:g}")
 
     _source: str = PrivateAttr("config")
     _overrides: _Overrides = PrivateAttr(_Overrides())

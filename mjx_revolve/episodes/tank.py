@@ -193,8 +193,11 @@ class Tank:
             Its place.
 
         Raises:
-            InputError: no place is free, or the robot or its genes do not fit.
+            InputError: there is no such world, no place is free, or the robot or its genes do not
+                fit.
         """
+        if not 0 <= world < self.worlds:
+            raise InputError(f"tank: expected a world below {self.worlds}; found {world}")
         each = self.places // self.worlds
         free = [k for k in range(world * each, (world + 1) * each) if self.robots[k] is None]
         if not free:
@@ -210,6 +213,7 @@ class Tank:
                 f"{list(position)} and {list(quat)}"
             )
         place = free[0]
+        seed = np.uint32(place if noise is None else noise)
         self._put(place, robot)
         self.robots[place] = robot
         slots = self._slots
@@ -217,7 +221,7 @@ class Tank:
         slots.start[:, place] = (*position, *np.asarray(quat, float) / size)
         slots.since[place] = self.steps
         slots.new[place] = True
-        slots.noise[place] = np.uint32(place if noise is None else noise)
+        slots.noise[place] = seed
         return place
 
     def remove(self, place: int) -> None:

@@ -41,7 +41,7 @@ from mjx_revolve.evolution.individuals import (
 )
 from mjx_revolve.evolution.learning import evaluate_again, learn, make_learner
 from mjx_revolve.evolution.novelty import axis_scale, novelty
-from mjx_revolve.evolution.reproduction import make_child, make_founder
+from mjx_revolve.evolution.reproduction import make_child, make_founders
 from mjx_revolve.evolution.selection import SCHEMES, Candidates, check_selection
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import csv_table
@@ -146,20 +146,9 @@ class BodyEvolution(IndividualEvolution):
         evolution = self.config.evolution
         count = self.selection.offspring if search.living else None
         count = count or evolution.population_size
-        seeds = self.fitness.seeds if not search.living else ()
-        sown = round((1 - self.bodies.random) * count)
-        sown = max(sown, min(len(seeds), count)) if seeds else 0
-        return [
-            make_founder(
-                self.fitness,
-                np.random.default_rng([evolution.seed, generation, k]),
-                search.next_number + k,
-                generation,
-                seed=seeds[k % len(seeds)] if k < sown else None,
-                mutant=k >= len(seeds),
-            )
-            for k in range(count)
-        ]
+        rngs = [np.random.default_rng([evolution.seed, generation, k]) for k in range(count)]
+        first, new = search.next_number, not search.living
+        return list(make_founders(self.fitness, rngs, first, generation, sow=new))
 
     def _children(self, search: BodySearch, generation: int) -> list[Individual]:
         """Children of selected parents."""

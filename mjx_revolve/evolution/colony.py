@@ -23,10 +23,14 @@ from mjx_revolve.episodes.colony_config import ColonyConfig, EnergyConfig, LifeC
 from mjx_revolve.episodes.tank import TankTrajectory
 from mjx_revolve.evolution.body_fitness import BodyFitness
 from mjx_revolve.evolution.individuals import Individual
-from mjx_revolve.evolution.reproduction import make_child, make_founder
+from mjx_revolve.evolution.reproduction import make_child, make_founder, make_founders
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.water.bed import bed_height
 
 # At birth, robots are further apart than the sum of their radii times this. A choice.
 _CLEARANCE = 1.0
+# Points along each edge of the arena at which the bed's height is looked up. A choice.
+_ACROSS = 65
 CAUSES = ("age", "energy", "lost", "failed")
 """Causes of death: age, an empty battery, the arena's end, a state that is not finite."""
 
@@ -123,6 +127,7 @@ class Rules(NamedTuple):
         looks: rows in an interval.
         window: positions over which fitness is measured.
         slots: the most robots that live at a time.
+        current: `[3]` of the water, in which robots drift [m/s].
     """
 
     colony: ColonyConfig
@@ -131,6 +136,7 @@ class Rules(NamedTuple):
     looks: int
     window: int
     slots: int
+    current: np.ndarray
 
     @property
     def interval(self) -> float:
@@ -142,6 +148,16 @@ class Rules(NamedTuple):
         """Height of the water's surface [m]."""
         return self.fitness.mixed.world.surface_height
 
+    def time(self, colony: Colony) -> float:
+        """Of a colony between two intervals [s]."""
+        steps = int(colony.tank["steps"]) if colony.tank else 0
+        return steps * self.fitness.mixed.world.timestep
+
+    @property
+    def birth_height(self) -> float:
+        """Height at which robots are born [m]."""
+        return self.surface - self.fitness.config.task.depth
+
     def measured(self, member: Member) -> Individual:
         """A member's individual, its score NaN until its age is the period of fitness.
 
@@ -149,6 +165,11 @@ class Rules(NamedTuple):
         """
         known = len(member.track) >= self.window
         return member.individual if known else replace(member.individual, score=float("nan"))
+
+    def aged(self, member: Member, now: float) -> Individual:
+        """The same, with its age [s] and the number of its children as measures."""
+        measures = {"age": now - member.born, "children": float(sum(member.children.values()))}
+        return replace(self.measured(member), measures=measures)
 
     def inside(self, position: np.ndarray) -> np.ndarray:
         """Positions `[..., 3]` within the arena, where its edges wrap [m]."""
@@ -161,13 +182,29 @@ class Rules(NamedTuple):
 
 
 def make_rules(fitness: BodyFitness) -> Rules:
-    """The rules of the colony that a fitness is configured for."""
-    colony, step = fitness.config.colony, fitness.mixed.world.timestep
+    """The rules of the colony that a fitness is configured for.
+
+    Raises:
+        InputError: robots would be born in the bed.
+    """
+    colony, world = fitness.config.colony, fitness.mixed.world
     assert colony is not None
+    step = world.timestep
     look = max(1, round(colony.look / step)) * step
     looks = max(1, round(colony.interval / look))
     window = 1 + max(1, round(colony.life.window / look))
-    return Rules(colony, fitness, look, looks, window, fitness.config.evolution.population_size)
+    slots = fitness.config.evolution.population_size
+    rules = Rules(colony, fitness, look, looks, window, slots, np.array(world.current, float))
+    if world.bed is not None:
+        line = np.linspace(-0.5, 0.5, _ACROSS) * colony.arena.size
+        bed = float(np.max(bed_height(world.bed, *np.meshgrid(line, line))))
+        if rules.birth_height <= bed:
+            raise InputError(
+                f"{fitness.config.origin('task.depth')}task.depth: expected less than "
+                f"{rules.surface - bed:g} m, the least depth of the bed in the arena, as robots of "
+                f"a colony are born at this depth; found {fitness.config.task.depth:g}"
+            )
+    return rules
 
 
 def _event(time: float, name: str, number: int, position: np.ndarray, **facts: object) -> Event:
@@ -186,7 +223,7 @@ def fitness_of(track: np.ndarray, look: float, settings: LifeConfig) -> float:
     evolution has it, or other weights; both horizontally and vertically.
 
     Args:
-        track: `[W, 3]` positions at equal intervals [m].
+        track: `[W, 3]` positions at equal intervals, relative to water that moves evenly [m].
         look: the interval [s].
         settings: weights, and the speed limit above which a robot is thrown about.
 
@@ -228,33 +265,37 @@ def share_power(distance: np.ndarray, settings: EnergyConfig) -> np.ndarray:
 def age_members(colony: Colony, trajectory: TankTrajectory, rules: Rules) -> Colony:
     """Members an interval later: their tracks, batteries and fitness.
 
-    A battery loses the work of the motors and the idle power, and gains the chargers' power.
+    A battery loses the work of the motors and the idle power, and gains the chargers' power. The
+    current does not count as way: fitness is of the track relative to it.
     """
     energy, members = rules.colony.energy, {}
-    for number, member in colony.members.items():
+    given = _charged(colony, trajectory, rules)
+    for (number, member), joules in zip(colony.members.items(), given, strict=True):
         k = member.slot
         # The trajectory is within the arena; the track continues beyond its edges.
         fresh = trajectory.position[:, :, k].astype(float) + member.offset
         track = np.concatenate([member.track, fresh])[-rules.window :]
+        drift = rules.look * np.arange(len(track))[:, None] * rules.current
+        score = fitness_of(track - drift, rules.look, rules.colony.life)
         charge = member.charge
         if energy is not None:
-            charge -= float(trajectory.energy[:, k].sum()) + energy.idle * rules.interval
-        individual = replace(
-            member.individual, score=fitness_of(track, rules.look, rules.colony.life)
-        )
+            used = float(trajectory.energy[:, k].sum()) + energy.idle * rules.interval
+            charge = min(charge - used + float(joules), energy.capacity)
+        individual = replace(member.individual, score=score)
         members[number] = replace(member, individual=individual, track=track, charge=charge)
-    if energy is None or not energy.chargers or not members:
-        return replace(colony, members=members)
-    chargers = np.array(energy.chargers)[None, :, None]
-    positions = _positions(members.values(), trajectory, rules)
-    distance = np.linalg.norm(positions[:, None] - chargers, axis=-1)
-    given = rules.look * np.sum(
-        [share_power(row, energy) for row in np.nan_to_num(distance, nan=1e9)], 0
-    )
-    for (number, member), joules in zip(members.items(), given, strict=True):
-        charge = min(member.charge + float(joules), energy.capacity)
-        members[number] = replace(member, charge=charge)
     return replace(colony, members=members)
+
+
+def _charged(colony: Colony, trajectory: TankTrajectory, rules: Rules) -> np.ndarray:
+    """`[N]` what members get of chargers in an interval [J]."""
+    energy, members = rules.colony.energy, colony.members.values()
+    if energy is None or not energy.chargers or not members:
+        return np.zeros(len(members))
+    chargers = np.array(energy.chargers)[None, :, None]
+    positions = _positions(members, trajectory, rules)
+    distance = np.linalg.norm(positions[:, None] - chargers, axis=-1)
+    rows = np.nan_to_num(distance, nan=1e9)
+    return np.asarray(rules.look * np.sum([share_power(row, energy) for row in rows], 0))
 
 
 def _positions(members: Iterable[Member], trajectory: TankTrajectory, rules: Rules) -> np.ndarray:
@@ -272,14 +313,14 @@ def remove_dead(
     """The colony without the members that have died, which are then in `died`."""
     now, alive, died, events = float(trajectory.time[-1]), {}, [], []
     for number, member in colony.members.items():
-        age, individual = now - member.born, rules.measured(member)
+        individual = rules.aged(member, now)
+        age = individual.measures["age"]
         cause = _cause_of_death(member, age, trajectory, rules)
         if cause is None:
             alive[number] = member
             continue
         score = float("nan") if cause == "failed" else individual.score
-        measures = {"age": age, "children": float(sum(member.children.values()))}
-        died.append(replace(individual, score=score, measures=measures))
+        died.append(replace(individual, score=score))
         events.append(
             _event(
                 now, "death", number, member.position,
@@ -370,14 +411,15 @@ def mate(colony: Colony, trajectory: TankTrajectory, rules: Rules) -> tuple[Colo
 def found_colony(
     colony: Colony, time: float, rules: Rules, rng: np.random.Generator
 ) -> tuple[Colony, list[Event]]:
-    """The first robots, all over the arena: seeds, then random ones.
+    """The first robots, all over the arena: seeds and their mutants, then random ones.
 
     A robot for which no free position is found leaves its number unused.
     """
     events: list[Event] = []
-    for k in range(rules.colony.birth.initial):
-        seed = rules.fitness.seeds[k] if k < len(rules.fitness.seeds) else None
-        founder = make_founder(rules.fitness, rng, colony.next_number, colony.generation, seed)
+    count = rules.colony.birth.initial
+    for founder in make_founders(
+        rules.fitness, [rng] * count, colony.next_number, colony.generation, sow=True
+    ):
         placed = _place(colony, founder, time, rules, rng, everywhere=True)
         if placed is None:
             colony = replace(colony, next_number=colony.next_number + 1)
@@ -429,7 +471,6 @@ def _place(
 ) -> tuple[Colony, Event] | None:
     """The colony with a new robot in the clinic, or anywhere; None: no free position was found."""
     birth, energy = rules.colony.birth, rules.colony.energy
-    height = rules.surface - rules.fitness.config.task.depth
     radius = _radius(individual, rules)
     others = [(m.position, _radius(m.individual, rules)) for m in colony.members.values()]
     for _ in range(birth.attempts):
@@ -437,7 +478,7 @@ def _place(
         if not everywhere:
             angle, away = rng.uniform(0, 2 * np.pi), birth.radius * np.sqrt(rng.uniform())
             x, y = away * np.cos(angle), away * np.sin(angle)
-        position = np.array([x, y, height])
+        position = np.array([x, y, rules.birth_height])
         yaw = rng.uniform(0, 2 * np.pi)
         if all(
             np.linalg.norm(position - other) > _CLEARANCE * (radius + own) for other, own in others

@@ -65,11 +65,11 @@ def observe_colony(
     members: dict[int, Member] = {}
     poses: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
     events: list[Event] = []
-    while _time_of(fitness, search) < begin - 1e-9:
+    while rules.time(search) < begin - 1e-9:
         proposal = evolution.ask(search)
         search = evolution.tell(proposal, evolution.evaluate(proposal)).search
-    until = _time_of(fitness, search) + duration
-    while _time_of(fitness, search) < until - 1e-9:
+    until = rules.time(search) + duration
+    while rules.time(search) < until - 1e-9:
         proposal = evolution.ask(search)
         trajectory = evolution.evaluate(proposal, rows)
         search = evolution.tell(proposal, trajectory).search
@@ -126,15 +126,10 @@ def open_colony(
     evolution = ColonyEvolution(config, Executor(fitness, fitness.block_size))
     for checkpoint in run.readable_checkpoints({}):
         search = evolution.from_arrays(checkpoint.arrays)
-        now = _time_of(fitness, search)
+        now = evolution.rules.time(search)
         if begin is None or now <= begin + 1e-9:
             return config, fitness, search, now if begin is None else begin
     if begin is None:
         raise InputError(f"{folder / 'checkpoints'}: expected a checkpoint that is whole; found "
                          "none")  # fmt: skip
     return config, fitness, Colony(), begin
-
-
-def _time_of(fitness: BodyFitness, search: Colony) -> float:
-    """Time of a colony [s]."""
-    return int(search.tank["steps"]) * fitness.mixed.world.timestep if search.tank else 0.0

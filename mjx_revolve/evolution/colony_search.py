@@ -76,7 +76,7 @@ class ColonyEvolution(IndividualEvolution):
             executor: an executor over a `BodyFitness`.
 
         Raises:
-            InputError: the world is gusty.
+            InputError: the world is gusty, or robots would be born in its bed.
         """
         super().__init__(config, executor)
         self.rules = make_rules(self.fitness)
@@ -130,7 +130,7 @@ class ColonyEvolution(IndividualEvolution):
         colony, births = give_birth(colony, now, rules, rng)
         self._synchronize(proposal.colony, colony, shift)
         self._held = self.tank.to_arrays()
-        living = [self.rules.measured(member) for member in colony.members.values()]
+        living = [rules.measured(member) for member in colony.members.values()]
         colony = replace(
             colony,
             elites=best_individuals([*colony.elites, *colony.died, *living]),
@@ -206,10 +206,11 @@ class ColonyEvolution(IndividualEvolution):
     # --- files of the run folder
 
     def logs(self, search: Colony) -> Mapping[str, Sequence[str]]:
-        """Individuals at birth and again at death (the later line counts), the living, events."""
+        """Individuals at birth, and at death or the end (the later counts); living; events."""
         logged = [*search.born, *search.died]
         if search.generation == self.config.evolution.generations:
-            logged += map(self.rules.measured, search.members.values())
+            now = self.rules.time(search)
+            logged += [self.rules.aged(member, now) for member in search.members.values()]
         return {
             INDIVIDUALS: [to_text(individual, self.fitness.genotype) for individual in logged],
             GENERATIONS: [living_line(search)],

@@ -2,13 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.evolution.body_fitness import BodyFitness
 from mjx_revolve.evolution.individuals import Individual
+
+
+def make_founders(
+    fitness: BodyFitness,
+    rngs: Sequence[np.random.Generator],
+    number: int,
+    generation: int,
+    sow: bool,
+) -> Iterator[Individual]:
+    """Individuals without parents: the configured seeds, mutants of them, then random ones.
+
+    Args:
+        fitness: its genotype, brains and seeds.
+        rngs: all randomness of each.
+        number: of the first; they are numbered in order.
+        generation: in which they are born.
+        sow: whether there are seeds among them; otherwise all are random.
+
+    Yields:
+        As many individuals as there are generators.
+    """
+    bodies, seeds = fitness.config.bodies, fitness.seeds if sow else ()
+    assert bodies is not None
+    sown = round((1 - bodies.random) * len(rngs))
+    sown = max(sown, min(len(seeds), len(rngs))) if seeds else 0
+    for k, rng in enumerate(rngs):
+        seed = seeds[k % len(seeds)] if k < sown else None
+        yield make_founder(fitness, rng, number + k, generation, seed, mutant=k >= len(seeds))
 
 
 def make_founder(

@@ -179,6 +179,8 @@ def test_what_cannot_be_is_refused(tank, mixed, robots):
         water.add(robots[0], None, (0, 0, np.nan))
     with pytest.raises(InputError, match="finite place and a quaternion of some length"):
         water.add(robots[0], None, (0, 0, -1), (0, 0, 0, 0))
+    with pytest.raises(InputError, match="expected a world below 1; found -1"):
+        water.add(robots[0], None, (0, 0, -1), world=-1)
     with pytest.raises(InputError, match="current: expected three numbers"):
         water.set_current((0, 1))
     assert water.count == 0

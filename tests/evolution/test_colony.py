@@ -9,6 +9,7 @@ import pytest
 from laboratory import ROOT
 from mjx_revolve.episodes.colony_config import ColonyConfig, EnergyConfig, LifeConfig
 from mjx_revolve.episodes.config import load_config, make_config
+from mjx_revolve.episodes.individual_log import INDIVIDUALS
 from mjx_revolve.episodes.tank import TankTrajectory
 from mjx_revolve.evolution.body_fitness import make_body_fitness
 from mjx_revolve.evolution.colony import (
@@ -18,6 +19,7 @@ from mjx_revolve.evolution.colony import (
     PendingBirth,
     age_members,
     fitness_of,
+    found_colony,
     give_birth,
     life_span,
     make_rules,
@@ -173,6 +175,15 @@ def test_an_interval_costs_energy_and_chargers_give_it(fitness, rules):
     assert member.charge == pytest.approx(5.0 + 0.2 * 4 * 0.5 - 0.2 * 4.0 - 4 * 0.25)
 
 
+def test_drifting_is_no_fitness(fitness, rules):
+    """What the current carries has none; what keeps its place in it swims."""
+    colony, trajectory = stand(fitness, [(0, 0, -1), (0, 0, -1)], [0.0, 0.0])
+    trajectory.qpos[:, 0, 0] = 0.1 * rules.look * np.arange(1, 5)
+    aged = age_members(colony, trajectory, rules._replace(current=np.array([0.1, 0, 0])))
+    scores = [member.individual.score for member in aged.members.values()]
+    assert scores == pytest.approx([0.0, 5 * 0.1 + 0.1])
+
+
 def test_edges_wrap_without_a_jump_in_the_track(fitness, rules):
     colony, trajectory = stand(fitness, [(1.3, 0, -1)], [0.1])
     wrapped, shift = wrap_edges(colony, rules)
@@ -209,6 +220,16 @@ def test_births(fitness, rules):
     assert found.pending_births == pending and found.next_number == 2 and not events
 
 
+def test_founders_are_seeds_their_mutants_and_random_ones():
+    sown = {"max_modules": 17, "max_hinges": 8, "seeds": ["spider"], "random": 0.4}
+    wide = {**SETTINGS["colony"], "arena": {"size": 9.0}}
+    config = make_config({**SETTINGS, "bodies": sown, "colony": wide}, ROOT)
+    rules = make_rules(make_body_fitness(config))
+    found, _ = found_colony(Colony(), 0.0, rules, np.random.default_rng(0))
+    origins = [one.origin for one in found.living]
+    assert origins == ["seed spider", *["mutant of spider"] * 2, "random", "random"]
+
+
 @pytest.fixture(scope="module")
 def history(config):
     """All intervals of a small colony: searches and rows."""
@@ -219,7 +240,7 @@ def history(config):
 
 @pytest.mark.slow
 def test_births_and_deaths_add_up(history, config):
-    found, _ = history
+    found, evolution = history
     alive, seen = set(), set()
     total = 0
     for search, row in found:
@@ -238,6 +259,9 @@ def test_births_and_deaths_add_up(history, config):
         assert len(set(slots)) == len(slots)
         assert row["time"] == pytest.approx(4.0 * search.generation)
         assert not row["best"] > row["champion"]  # newborns' short spurts do not count
+    last = (json.loads(line) for line in evolution.logs(search)[INDIVIDUALS])
+    ages = {line["id"]: line["measures"]["age"] for line in last}
+    assert all(ages[n] == 48.0 - member.born for n, member in search.members.items())
     events = [e["event"] for search, _ in found for e in search.events]
     assert {"birth", "mating", "death"} == set(events)  # this seed has all of them
     children = [i for search, _ in found for i in search.born if i.parents]
@@ -293,6 +317,17 @@ def test_what_cannot_be_a_colony_is_refused():
         colony={**colony, "look": 5.0}
     )
     assert "colony.arena.edge: expected" in wrong(colony={**colony, "arena": {"edge": "wall"}})
+    for changes, said in (
+        ({"arena": {"size": 2.5, "depth": 1.0}}, "arena.depth: expected more than task.depth (1 m"),
+        ({"life": {"window": 9.0, "max_age": 8.0}}, "window: expected at most life.max_age (8 s)"),
+        ({"energy": {"chargers": [[0, 9, -1]]}}, "chargers[0]: expected a place in the arena"),
+    ):
+        assert said in wrong(colony=colony | changes)
+    seeds = {**SETTINGS["bodies"], "seeds": ["core"] * 6}
+    assert "birth.initial: expected at least as many as bodies.seeds (6)" in wrong(bodies=seeds)
+    shallow = make_config({**SETTINGS, "world": SETTINGS["world"] | {"bed": -0.5}}, ROOT)
+    with pytest.raises(InputError, match=r"task.depth: expected less than 0.5 m, the least depth"):
+        make_rules(make_body_fitness(shallow))
 
 
 def test_the_shipped_configuration():

@@ -284,6 +284,16 @@ def test_the_stock_of_a_run(tmp_path):
     assert catalogue.mixed.capacity.hinges >= 8
 
 
+def test_robots_that_float_or_are_too_light_do_not_hinder_others(tmp_path):
+    (tmp_path / "sea.yaml").write_text("name: lake\ndensity: 1025\ntimestep: 0.0125\n"
+                                       "drag: ellipsoid\n")  # fmt: skip
+    names = {
+        one.short for one in load_catalogue(["lake_colony"], str(tmp_path / "sea.yaml")).entries
+    }
+    assert "bluerov2" in names  # it floats
+    assert "fish" not in names  # its tail is too light for the step
+
+
 @pytest.fixture(scope="module")
 def catalogue():
     """Of a body and a configuration, with all shipped bodies: that takes seconds."""

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_revolve.body.morphology import Morphology, load_morphology, trim_neutral
-from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.engine.robot import build_robot, check_timestep
 from mjx_revolve.engine.spheres import count_spheres
 from mjx_revolve.episodes.config import Config, load_config, override_config
 from mjx_revolve.episodes.fitness import MixedFitness, make_mixed_fitness
@@ -90,7 +90,7 @@ def load_catalogue(paths: Sequence[str], world: str | None = None) -> RobotCatal
         world: another world: a name or a YAML; None: the one above.
 
     Returns:
-        The named robots, then all shipped morphologies.
+        The named robots, then all shipped morphologies that the world's step can simulate.
 
     Raises:
         InputError: a file is missing or wrong, or a run has another controller.
@@ -127,10 +127,23 @@ def load_catalogue(paths: Sequence[str], world: str | None = None) -> RobotCatal
         known = {(draft.short, draft.name) for draft in drafts}
         more = _bodies(config, water, shipped[name], "shipped")
         alike = config.controller.sensors is not None or more[0].body.sensors is None
-        drafts += [x for x in more if alike and (x.short, x.name) not in known]
+        if alike and _can_swim(more[0].body, water):
+            drafts += [x for x in more if (x.short, x.name) not in known]
     title = " and ".join(Path(path).stem or path for path in paths)
-    mixed = make_mixed_fitness(config, [draft.body for draft in drafts])
+    # Drafts are trimmed, as far as they can be.
+    mixed = make_mixed_fitness(
+        override_config(config, {"trim": "none"}), [draft.body for draft in drafts]
+    )
     return RobotCatalogue(mixed, tuple(_entry(mixed, draft) for draft in drafts), title)
+
+
+def _can_swim(morphology: Morphology, water: World) -> bool:
+    """Whether the world's step can simulate a robot: some are too light for a long one."""
+    try:
+        check_timestep(build_robot(morphology, water))
+    except InputError:
+        return False
+    return True
 
 
 def _entry(mixed: MixedFitness, draft: _Draft) -> CatalogueEntry:

@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -183,7 +182,6 @@ class LiveSimulation:
 
     def state_event(self) -> str:
         """The event with the state that all pages show."""
-        moving = replace(self.world, current=self.current)
         return _event(
             "state",
             {
@@ -193,7 +191,7 @@ class LiveSimulation:
                 "speed": round(self._speed, 3),
                 "current": [*self.current],
                 "busy": round(self.busy, 1),
-                "waves": pack_waves(moving),
+                "waves": pack_waves(self.world),
             },
         )
 
