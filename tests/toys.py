@@ -20,6 +20,35 @@ from mjx_revolve.evolution.run_folder import RunFolder
 # In metrics.csv, all but these is reproducible.
 CLOCK = ("seconds", "evaluations_per_second")
 
+# A configuration: five robots in a small arena, with a charger.
+COLONY = {
+    "trim": "neutral",
+    "world": {"name": "empty_underwater", "bed": False, "drag": "ellipsoid", "timestep": 0.0125},
+    "controller": {"type": "sine"},
+    "task": {"type": "speed", "duration": 2.0, "settle": 0.5, "trials": 1, "depth": 1.0},
+    "bodies": {
+        "max_modules": 5,
+        "max_hinges": 2,
+        "brains": {"inheritance": "darwinian", "std_init": 1.0},
+    },
+    "colony": {
+        "interval": 4.0,
+        "look": 0.5,
+        "arena": {"size": 2.5, "depth": 3.0},
+        "birth": {"radius": 1.0, "gestation": 6.0, "initial": 5, "least": 3},
+        "mating": {"distance": 0.9, "likeness": 0.1, "adult": 3.0, "children": 2},
+        "life": {"window": 4.0, "max_age": 40.0, "childhood": 12.0, "full_fitness": 0.2},
+        "energy": {"start": 5.0, "capacity": 8.0, "idle": 0.2, "chargers": [[0, 0, -1]]},
+    },
+    "evolution": {
+        "population_size": 8,
+        "generations": 12,
+        "checkpoint_every": 5,
+        "seed": 3,
+        "passport": False,
+    },
+}
+
 
 def write_config(path: Path, **evolution) -> Path:
     """Writes a configuration for any of them, beside the robot that it names; 7 generations."""

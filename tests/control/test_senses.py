@@ -204,7 +204,7 @@ def test_an_accelerometer_in_a_spinning_vacuum_is_mujocos():
     assert np.abs(data.sensordata).max() > 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_touch_is_the_beds_force_on_each_body(robot):
     """At rest in still lanes above, in and on the bed: as `push` has it of the whole robot."""
     qpos, qvel = random_states(robot, LANES, seed=5, speed=0.0)

@@ -105,6 +105,7 @@ def _descends(m, body, above):
     return body == above
 
 
+@pytest.mark.long
 def test_the_inertia_box_is_that_of_mujocos_principal_axes():
     for robot in robots("inertia_box"):
         m, columns = robot.mj_model, read_constants(robot.assembly)

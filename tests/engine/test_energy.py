@@ -40,6 +40,7 @@ def test_a_swimmer_in_a_current_and_in_other_water():
     assert balance(robot, found, drawn, 1.2).residual > 0.1
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("timestep", [0.005, 0.00125])
 def test_arms_that_clap(timestep):
     """Where modules hit each other energy is lost, and never made."""
@@ -51,6 +52,7 @@ def test_arms_that_clap(timestep):
     assert own.residual < (0.05 if timestep > 0.002 else 0.03)
 
 
+@pytest.mark.long
 def test_a_crawler_gives_energy_to_the_bed():
     robot, found = swing(read(_ARM), 0.08, bed={"kind": "flat", "height": -0.1})
     own = balance(robot, found)
@@ -63,6 +65,7 @@ def test_thrusters():
     assert own.joints == 0 < own.drag and own.residual < 0.01
 
 
+@pytest.mark.long
 def test_what_a_trajectory_cannot_tell():
     robot, found = swing(read(OAR), 2.0, 0.1, shear={"velocity": [0.2, 0, 0]})
     assert balance(robot, found) is None

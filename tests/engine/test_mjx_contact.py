@@ -120,7 +120,7 @@ def slid():
     return robot, qpos, *march(robot, 0.6, qpos, qvel, water=water, engine="mjx")[:3]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_at_rest_it_carries_the_weight_under_water(slid):
     """And the whole weight where there is no water: by the depth that MuJoCo's softness makes."""
     robot, _, _, q, v = slid
@@ -222,7 +222,7 @@ def test_jointed_without_water_it_is_mujocos_step():
     assert np.abs(q[:, 7:]).max() > 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_slope_is_slid_down_as_coulomb_has_it():
     """On one triangle of a height field: (W - B) (sin - μ cos) / (m + m_a)."""
     bed = Bed("lake", -60.0, 10.0, 200.0, friction=0.3, contact="mjx")

@@ -84,6 +84,7 @@ def test_a_servo_is_as_stiff_at_every_step(timestep):
         assert (np.asarray(inertia)[:, 0] >= 0.36 * timestep**2 * rest * (1 - 1e-6)).all()
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("dt", [0.005, 0.0125])
 def test_hinges_that_reverse_together_do_not_push_each_other_far_beyond_the_top_speed(dt):

@@ -111,12 +111,13 @@ TRAVELLING = lambda phase, lag: np.sin(phase - lag)  # noqa: E731
 JERKING = lambda phase, lag: np.sign(np.sin(phase - lag + 1e-6))  # noqa: E731
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name, strokes",
     [
-        ("snake", [(0.3, STANDING, 2, 0.012, 3)]),
         ("fish", [(0.6, TRAVELLING, 4, 0.003, 2), (0.7, JERKING, 3, 0.04, 3)]),
+        ("snake", [(0.3, STANDING, 2, 0.012, 3)]),
     ],
 )
 def test_a_stroke_in_the_default_water_is_of_second_order(name, strokes):
@@ -420,7 +421,7 @@ def test_gradient_at_rest_and_at_the_waterline():
     check_slope(robot, {}, waterline, drop, kinks=kinks, compiled=USUAL)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_gradient_in_waves_and_in_contact():
     """In the moment at which the sea is met, too; and sliding over the bed with all corners in it.
 

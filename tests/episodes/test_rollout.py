@@ -33,7 +33,7 @@ def still(elbow):
     return simulate(elbow, None, SPAN)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_depths_are_below_the_surface_of_the_water_that_is_given():
     """What is sensed, floats and is told of depth moves with the surface, all of it alike.
 
@@ -215,7 +215,7 @@ def test_wrong_genes(elbow):
         simulate(elbow, bind_genes(controller, np.zeros((3, 1))), SPAN)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_gradient_through_a_rollout_of_a_jointed_body():
     """In start, speed, current, a joint's target and its speed; half out of the water.
 

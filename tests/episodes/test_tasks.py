@@ -76,7 +76,7 @@ def test_the_waters_force_on_a_neutral_body_is_its_weight(settings):
     assert fitness.task.unit == "N"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_beds_force_on_a_body_at_rest_is_what_the_water_leaves_of_its_weight(settings):
     tank = {"bed": {"kind": "flat", "height": -2.0}}
     fitness, found = score(settings("standing", world=tank))
@@ -88,7 +88,7 @@ def test_the_beds_force_on_a_body_at_rest_is_what_the_water_leaves_of_its_weight
     assert judged == pytest.approx(found, rel=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_joints_are_recorded_for_one_body_and_for_many(settings, tmp_path):
     """Held at their offsets, in the robot's own order, whatever the engine's."""
     elbow = read(_ELBOW)

@@ -191,7 +191,7 @@ TASKS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("task", TASKS)
 def test_rewards_add_up_whatever_the_task_and_the_water(config, task):

@@ -69,6 +69,7 @@ def score(executor, one, key):
     return score_brains(executor, [one], [genes], key)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["lake_coevolve", "bed_coevolve", "lake_map_elites"])
 def test_shipped_configurations(name):

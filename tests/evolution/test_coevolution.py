@@ -68,7 +68,7 @@ def founders(config, executor):
     return evolution.ask(evolution.start()).offspring
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_learning_does_not_depend_on_the_other_bodies(folder):
     for learning in ({}, {"population_size": 4, "generations": 3}):
         config, executor = start(folder, {"learning": learning})
@@ -131,6 +131,7 @@ def test_where_a_passport_is_required_the_living_are_candidates_too(folder, monk
     assert len(tried) == 2 and tried[0] in failing
 
 
+@pytest.mark.long
 def test_blocks_hold_one_body_where_many_brains_are_tried(folder):
     for size, alone in ((1, False), (5, False), (6, True), (9, False), (20, True)):
         config, executor = start(folder, {"learning": {"population_size": size}})

@@ -33,34 +33,7 @@ from mjx_revolve.evolution.executor import make_executor
 from mjx_revolve.evolution.generations import run_generations
 from mjx_revolve.evolution.reproduction import make_founder
 from mjx_revolve.inputs.errors import InputError
-
-SETTINGS = {
-    "trim": "neutral",
-    "world": {"name": "empty_underwater", "bed": False, "drag": "ellipsoid", "timestep": 0.0125},
-    "controller": {"type": "sine"},
-    "task": {"type": "speed", "duration": 2.0, "settle": 0.5, "trials": 1, "depth": 1.0},
-    "bodies": {
-        "max_modules": 5,
-        "max_hinges": 2,
-        "brains": {"inheritance": "darwinian", "std_init": 1.0},
-    },
-    "colony": {
-        "interval": 4.0,
-        "look": 0.5,
-        "arena": {"size": 2.5, "depth": 3.0},
-        "birth": {"radius": 1.0, "gestation": 6.0, "initial": 5, "least": 3},
-        "mating": {"distance": 0.9, "likeness": 0.1, "adult": 3.0, "children": 2},
-        "life": {"window": 4.0, "max_age": 40.0, "childhood": 12.0, "full_fitness": 0.2},
-        "energy": {"start": 5.0, "capacity": 8.0, "idle": 0.2, "chargers": [[0, 0, -1]]},
-    },
-    "evolution": {
-        "population_size": 8,
-        "generations": 12,
-        "checkpoint_every": 5,
-        "seed": 3,
-        "passport": False,
-    },
-}
+from toys import COLONY
 
 
 def test_fitness_by_hand():
@@ -88,7 +61,7 @@ def test_chargers_share_their_power():
 
 @pytest.fixture(scope="module")
 def config():
-    return make_config(SETTINGS, ROOT)
+    return make_config(COLONY, ROOT)
 
 
 @pytest.fixture(scope="module")
@@ -222,8 +195,8 @@ def test_births(fitness, rules):
 
 def test_founders_are_seeds_their_mutants_and_random_ones():
     sown = {"max_modules": 17, "max_hinges": 8, "seeds": ["spider"], "random": 0.4}
-    wide = {**SETTINGS["colony"], "arena": {"size": 9.0}}
-    config = make_config({**SETTINGS, "bodies": sown, "colony": wide}, ROOT)
+    wide = {**COLONY["colony"], "arena": {"size": 9.0}}
+    config = make_config({**COLONY, "bodies": sown, "colony": wide}, ROOT)
     rules = make_rules(make_body_fitness(config))
     found, _ = found_colony(Colony(), 0.0, rules, np.random.default_rng(0))
     origins = [one.origin for one in found.living]
@@ -298,7 +271,7 @@ def test_it_goes_on_from_any_checkpoint_bit_for_bit(history, config):
 
 def test_what_cannot_be_a_colony_is_refused():
     def wrong(**changes):
-        data = {**SETTINGS, **changes}
+        data = {**COLONY, **changes}
         with pytest.raises(InputError) as error:
             make_config(data, ROOT)
         return str(error.value)
@@ -306,9 +279,9 @@ def test_what_cannot_be_a_colony_is_refused():
     assert "bodies: expected how bodies evolve, as there is a colony; found nothing" in wrong(
         bodies=None
     )
-    learning = {**SETTINGS["bodies"], "learning": {"population_size": 4}}
+    learning = {**COLONY["bodies"], "learning": {"population_size": 4}}
     assert "bodies.learning: expected nothing, as in a colony" in wrong(bodies=learning)
-    colony = SETTINGS["colony"]
+    colony = COLONY["colony"]
     many = {**colony, "birth": {"initial": 9, "radius": 1.0}}
     assert "birth.initial: expected at most evolution.population_size (8); found 9" in wrong(
         colony=many
@@ -323,9 +296,9 @@ def test_what_cannot_be_a_colony_is_refused():
         ({"energy": {"chargers": [[0, 9, -1]]}}, "chargers[0]: expected a place in the arena"),
     ):
         assert said in wrong(colony=colony | changes)
-    seeds = {**SETTINGS["bodies"], "seeds": ["core"] * 6}
+    seeds = {**COLONY["bodies"], "seeds": ["core"] * 6}
     assert "birth.initial: expected at least as many as bodies.seeds (6)" in wrong(bodies=seeds)
-    shallow = make_config({**SETTINGS, "world": SETTINGS["world"] | {"bed": -0.5}}, ROOT)
+    shallow = make_config({**COLONY, "world": COLONY["world"] | {"bed": -0.5}}, ROOT)
     with pytest.raises(InputError, match=r"task.depth: expected less than 0.5 m, the least depth"):
         make_rules(make_body_fitness(shallow))
 

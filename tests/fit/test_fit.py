@@ -188,7 +188,7 @@ def test_a_search_that_begins_far_away_arrives(auv):
     np.testing.assert_allclose([v.value for v in fit.values], np.exp(true), rtol=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_interval_of_a_servos_limit_is_no_narrower_where_the_motion_jumps():
     """Over a step of 1e-4 the jump at 0.0835 passes for a slope a third too steep."""
     world = load_world("lake", bed="off", drag="faces", self_contact=False, timestep=0.01)
@@ -221,6 +221,7 @@ def test_a_common_scale_is_named_and_not_found():
     assert "up to a common factor" in unknown.words
 
 
+@pytest.mark.long
 def test_a_robot_that_only_coasts_does_not_tell_its_thrust(auv):
     found = simulate_signals(auv, ["drag"], [0.2], velocity=(0, 0.3, 0, 0, 0, 0.5), duration=6.0)
     fit = fit_robot(auv, [make_noisy(found)], ["drag", "thrust"], FitSettings(held_out=0.0))

@@ -56,6 +56,7 @@ def fit(auv, tmp_path, monkeypatch):
     return go
 
 
+@pytest.mark.long
 def test_a_quaternion_of_another_order_is_named(auv, signals):
     recording = make_noisy(signals, rate=40)
     order = {"qw": "qx", "qx": "qy", "qy": "qz", "qz": "qw"}
@@ -102,6 +103,7 @@ def as_map(names):
     return [f"--map=mark.{n}=core:{','.join(map(str, MARKS[n]))}" for n in names]
 
 
+@pytest.mark.long
 def test_a_table_of_poses_with_a_gap_and_lost_frames(fit, signals, tmp_path, capsys):
     columns = at_frames(make_noisy(signals, lost=0.05, seed=1))
     kept = (columns["time"] < 3.0) | (columns["time"] > 3.6)  # no command changes then

@@ -274,7 +274,7 @@ def test_in_double_precision_they_agree_to_rounding(kind, tmp_path, monkeypatch)
         np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-11)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_noise_rate_and_delay_are_the_devices(tmp_path):
     """What the simulated devices gave, fed to a file whose brain knows of none of it."""
     devices = [

@@ -16,6 +16,7 @@ from mjx_revolve.view.colony_history import make_history
 from mjx_revolve.view.colony_pictures import plot_population
 from mjx_revolve.view.population import trace_line
 from mjx_revolve.view.report.data import read_run
+from toys import COLONY
 
 NOWHERE = np.zeros(3)
 # Two founders; 2 and 3 are of the first one's family, 4 is a stranger. 0 and 3 die.
@@ -81,27 +82,18 @@ def test_births_and_deaths_add_up(history):
     assert top.lines[0].get_ydata().max() == 4
 
 
-SETTINGS = {
-    "trim": "neutral",
-    "world": {"name": "empty_underwater", "bed": False, "drag": "ellipsoid", "timestep": 0.0125},
-    "controller": {"type": "sine"},
-    "task": {"type": "speed", "duration": 0.5, "settle": 0.1, "trials": 1, "depth": 1.0},
-    "bodies": {"max_modules": 4, "max_hinges": 2, "brains": {"inheritance": "darwinian"}},
-    "colony": {
+SETTINGS = COLONY | {
+    "task": COLONY["task"] | {"duration": 0.5, "settle": 0.1},
+    "colony": COLONY["colony"]
+    | {
         "interval": 2.0,
         "look": 0.05,  # as often as pages have poses: one program serves both
+        "birth": COLONY["colony"]["birth"] | {"radius": 0.9, "gestation": 2.0},
         "arena": {"size": 2.0, "depth": 3.0},
-        "birth": {"radius": 0.9, "gestation": 2.0, "initial": 5, "least": 3},
         "mating": {"distance": 1.0, "likeness": 0.0, "adult": 2.0, "children": 2},
         "life": {"window": 2.0, "max_age": 12.0, "childhood": 4.0, "full_fitness": 0.2},
     },
-    "evolution": {
-        "population_size": 8,
-        "generations": 8,
-        "checkpoint_every": 4,
-        "seed": 3,
-        "passport": False,
-    },
+    "evolution": COLONY["evolution"] | {"generations": 8, "checkpoint_every": 4},
 }
 
 
@@ -114,7 +106,7 @@ def run(tmp_path_factory, quick_compiles):
     return folder / "run"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_report_of_a_colony(run, tmp_path):
     page = tmp_path / "page.html"
     assert run_command(report.main, [str(run), "--out", str(page)]) == 0
@@ -125,7 +117,7 @@ def test_the_report_of_a_colony(run, tmp_path):
     assert read_run(run).history.spans.keys() == read_run(run).population.lives.keys()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_page_of_a_run(run, capsys):
     argv = [str(run), "--colony", "--duration", "1"]  # half an interval
     assert run_command(viewer.main, argv) == 0

@@ -71,7 +71,7 @@ def seen(tmp_path_factory):
     return fitness, trajectory, trace_sensors(fitness, trajectory, KEY, trial=1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_is_true_is_the_trajectorys(seen):
     fitness, trajectory, felt = seen
     found = {one.sensor.label: one for one in felt}

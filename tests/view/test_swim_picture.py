@@ -119,7 +119,7 @@ def test_the_picture_is_whole_and_always_the_same(small):
     assert first == second
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_robot_is_inside_the_frame_whichever_way_it_swims(small):
     """Bright red: nothing else on the page is, so its pixels are the robot's."""
     modules = tuple(replace(m, rgb=(1.0, 0.0, 0.0)) for m in small.morphology.modules)

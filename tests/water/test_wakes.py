@@ -236,7 +236,7 @@ def stroke(robot, steps, lanes=1):
     return np.broadcast_to(0.8 * turns[:, None, None], (steps, 1, lanes))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_both_engines_and_bodies_side_by_side_remember_alike():
     robot = swimmer(added_mass=True)
     qpos, qvel = at_rest(robot, 1, -5.0)
