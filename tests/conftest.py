@@ -105,13 +105,12 @@ def fresh_traces():
 # Files are dealt out whole, in this order: those that take longest go first, so that no worker is
 # left alone with one at the end.
 _LONGEST = (
-    "test_many_bodies", "test_examples", "test_end_to_end", "test_executor", "test_docs",
-    "test_dynamics", "test_brain", "test_coevolution", "test_step", "test_bodies_end_to_end",
-    "test_rollout", "test_mjx_contact", "test_cluster", "test_report", "test_tasks",
-    "test_vector_env", "test_self_contact", "test_collisions", "test_forces",
-    "test_sensory_brains", "test_windows", "test_tank", "test_colony", "test_wakes",
-    "test_lift_drag", "test_buoyancy", "test_water", "test_contact", "test_surface_tension",
-    "test_thrust_step", "test_sweep", "test_fitness", "test_swim_picture", "test_assembly",
+    "test_step", "test_self_contact", "test_coevolution", "test_docs", "test_examples",
+    "test_bodies_end_to_end", "test_fit", "test_end_to_end", "test_many_bodies", "test_energy",
+    "test_executor", "test_dynamics", "test_brain", "test_colony", "test_rollout",
+    "test_collisions", "test_vector_env", "test_report", "test_fuzz", "test_cluster",
+    "test_gene_search", "test_tank", "test_tasks", "test_measured", "test_servos",
+    "test_closed_forms", "test_fit_recordings",
 )  # fmt: skip
 
 
