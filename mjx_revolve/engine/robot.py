@@ -331,16 +331,19 @@ def check_timestep(robot: Robot, engine: str = "population") -> None:
         )
     table, world, assembly = robot.fluid, robot.world, robot.assembly
     explicit = np.array([find_drag_law(name).explicit for name in table.drag])
+    longest: list[tuple[float, float, str]] = []
     for body in np.unique(table.body[explicit]):
         rows = explicit & (table.body == body)
         mass = assembly.mass[body] + world.density * table.carried_mass[rows].min(-1).sum()
         # Twice ½ C_d A v, the derivative of the force by the speed: both laws have a C_d of 1,
         # whatever the parts' coefficients are.
         derivative = world.density * table.face_area[rows].max(-1).sum() * _REFERENCE_SPEED
-        longest = 2 * mass / max(derivative, 1e-30)
-        if world.timestep > longest:
-            raise InputError(
-                f"timestep: expected at most {longest:.2g} s, as drag: {world.drag} is explicit "
-                f"and body {assembly.names[body]!r} of {mass:.3g} kg is light; found "
-                f"{world.timestep:g} s (drag: faces bears any step)"
-            )
+        longest.append((2 * mass / max(derivative, 1e-30), mass, assembly.names[body]))
+    most, mass, name = min(longest, default=(np.inf, 0.0, ""))
+    if world.timestep > most:
+        digit = 10.0 ** (np.floor(np.log10(most)) - 1)
+        raise InputError(
+            f"timestep: expected at most {digit * np.floor(most / digit):.2g} s, as drag: "
+            f"{world.drag} is explicit and body {name!r} of {mass:.3g} kg is light; found "
+            f"{world.timestep:g} s (drag: faces bears any step)"
+        )

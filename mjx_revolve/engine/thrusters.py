@@ -118,7 +118,10 @@ def run_thrusters(
 
     clipped = jnp.clip(ctrl, cast(thrusters.low), cast(thrusters.high))
     after = lagged_command(lagged, clipped, thrusters.kept)
-    acting = jnp.where(thrusters.delayed, lagged, clipped)
+    delayed = thrusters.delayed
+    # Folded by XLA, the selection would leave `ctrl` unused in its piece of the step: it aborts.
+    every = isinstance(delayed, np.ndarray) and bool(delayed.all())
+    acting = lagged if every else jnp.where(delayed, lagged, clipped)
     push = dead_band_thrust(
         acting,
         *map(cast, (thrusters.backward, thrusters.forward)),

@@ -1,5 +1,6 @@
 """Thrusters and fins in whole steps: steady speed, lag, torque, MuJoCo's actuators, the fish."""
 
+import re
 from dataclasses import replace
 
 import jax
@@ -21,8 +22,10 @@ from laboratory import (
     world,
 )
 from mjx_revolve.body.module_types import Thruster
-from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.engine.robot import build_robot, check_timestep
 from mjx_revolve.episodes.simulate import simulate
+from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.water.world import load_world
 
 RHO, G = 999.1026, 9.81
 CUBE = (0.1, 0.1, 0.1)
@@ -168,3 +171,22 @@ def test_the_auv_surges_without_pitch_and_heaves_without_drift():
     assert np.abs(heave[:, :2]).max() < 1e-3
     # Yaw stays, as propellers of a pair turn against each other.
     assert np.abs(q[:, 6]).max() < 1e-3
+
+
+def test_lagged_thrusters_compile_in_any_water():
+    """XLA ended the process where a piece of the step left its commands unused."""
+    tank = load_world("empty_underwater", waves=[{"amplitude": 0.03, "wavelength": 1.0}],
+                      surface_tension=True, bed=None)  # fmt: skip
+    robot = build_robot(body("auv"), tank)
+    found = simulate(robot, np.zeros(robot.mj_model.nu), 0.05)
+    assert np.isfinite(np.asarray(found.qvel)).all()
+
+
+def test_the_longest_step_that_a_message_names_is_accepted():
+    def build(timestep):
+        tank = load_world("empty_underwater", drag="inertia_box", timestep=timestep)
+        return build_robot(body("fish"), tank)
+
+    with pytest.raises(InputError, match="timestep: expected at most") as found:
+        check_timestep(build(0.02))
+    check_timestep(build(float(re.search("at most ([0-9.]+) s", str(found.value))[1])))
