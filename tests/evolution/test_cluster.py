@@ -93,7 +93,6 @@ def said(caplog):
     return [r.getMessage() for r in caplog.records if r.name.startswith("mjx_revolve")]
 
 
-@pytest.mark.long
 def test_workers_may_join_at_any_time(cluster, executor, caplog):
     check_scores(executor, 1)
     assert executor.num_workers == 1 and len(executor.workers) == 1
