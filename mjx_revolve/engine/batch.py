@@ -297,7 +297,7 @@ def fit_capacity(
     columns, world = read_constants(assembly, meeting), robots[0].world
     carries = columns.parts.carried is not None
     sizes = _sizes(assembly, columns)
-    if modules and isinstance(find_drag_law(world.drag), BodyDragLaw):  # no part may overflow
+    if modules and _drags_whole_bodies(world):
         sizes = _widest_bodies(assembly, columns, sizes, modules)
     types = {m.kind.name: m.kind for r in robots for m in r.morphology.modules}
     types |= {kind.name: kind for kind in kinds}
@@ -368,8 +368,7 @@ def _choose_groups(
     """
     most = {laws: int(sizes.parts[laws].max()) for laws in every}
     most_root = {laws: int(sizes.root_parts[laws].max()) for laws in every}
-    # The inertia box belongs to a body as a whole, and so does its submerged fraction: no overflow.
-    whole = isinstance(find_drag_law(assembly.world.drag), BodyDragLaw)
+    whole = _drags_whole_bodies(assembly.world)
     least = max(1, *most.values()) if whole and most else 1
     widest = max(1, *most_root.values()) if most_root else 1
     on_root = [widest]
@@ -395,6 +394,11 @@ def _choose_groups(
                 best = (cost, groups, order)
     assert best is not None
     return best[1], best[2]
+
+
+def _drags_whole_bodies(world: World) -> bool:
+    """Whether no part may overflow into another row: drag and submerged share are of a body."""
+    return isinstance(find_drag_law(world.drag), BodyDragLaw)
 
 
 def _widest_bodies(
@@ -781,8 +785,7 @@ def _check_fit(
             raise InputError(
                 f"robot {names[k]!r}: expected at most {most} {what}; found {counts[k]}"
             )
-    whole = isinstance(find_drag_law(assembly.world.drag), BodyDragLaw)
-    if whole and np.any(order.overflow):
+    if _drags_whole_bodies(assembly.world) and np.any(order.overflow):
         k = int(np.argmax(order.overflow))
         raise InputError(
             f"robot {names[order.robot[k]]!r}: expected at most as many parts on a body as the "

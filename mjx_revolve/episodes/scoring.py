@@ -18,7 +18,7 @@ from mjx_revolve.engine.plant import BodyGeometry
 from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.tasks import Task
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.water.bed import bed_height
+from mjx_revolve.water.bed import highest_bed
 from mjx_revolve.water.flow import drift_speed
 from mjx_revolve.water.world import World
 
@@ -126,9 +126,8 @@ def may_touch_bed(task: Task, settings: TaskConfig, world: World, reach: float) 
     """
     if world.bed is None:
         return False
-    line = np.linspace(-reach, reach, 101)
-    highest = float(np.max(bed_height(world.bed, *np.meshgrid(line, line))))
-    return task.on_bed or world.surface_height - settings.depth - reach < highest
+    lowest = world.surface_height - settings.depth - reach
+    return task.on_bed or lowest < highest_bed(world.bed, reach)
 
 
 def pick_near(choices: Mapping[int, float], wanted: object, place: str, unit: str) -> int:

@@ -25,12 +25,10 @@ from mjx_revolve.evolution.body_fitness import BodyFitness
 from mjx_revolve.evolution.individuals import Individual
 from mjx_revolve.evolution.reproduction import make_child, make_founder, make_founders
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.water.bed import bed_height
+from mjx_revolve.water.bed import highest_bed
 
 # At birth, robots are further apart than the sum of their radii times this. A choice.
 _CLEARANCE = 1.0
-# Points along each edge of the arena at which the bed's height is looked up. A choice.
-_ACROSS = 65
 CAUSES = ("age", "energy", "lost", "failed")
 """Causes of death: age, an empty battery, the arena's end, a state that is not finite."""
 
@@ -196,8 +194,7 @@ def make_rules(fitness: BodyFitness) -> Rules:
     slots = fitness.config.evolution.population_size
     rules = Rules(colony, fitness, look, looks, window, slots, np.array(world.current, float))
     if world.bed is not None:
-        line = np.linspace(-0.5, 0.5, _ACROSS) * colony.arena.size
-        bed = float(np.max(bed_height(world.bed, *np.meshgrid(line, line))))
+        bed = highest_bed(world.bed, colony.arena.size / 2)
         if rules.birth_height <= bed:
             raise InputError(
                 f"{fitness.config.origin('task.depth')}task.depth: expected less than "

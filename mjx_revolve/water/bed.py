@@ -86,6 +86,20 @@ def bed_height(bed: Bed, x: Any, y: Any) -> Any:
     return bed.height + (bed.highest - bed.height) * (smooth + dunes * where)
 
 
+def highest_bed(bed: Bed, reach: float) -> float:
+    """The bed's greatest height within a square around the world's origin.
+
+    Args:
+        bed: the bed.
+        reach: half of the square's edge [m].
+
+    Returns:
+        z, world frame [m], of the highest of 101 x 101 points.
+    """
+    line = np.linspace(-reach, reach, 101)
+    return float(np.max(bed_height(bed, *np.meshgrid(line, line))))
+
+
 def _over(x: Any, number: float) -> Any:
     """A quotient that is rounded alike by NumPy and XLA, which multiplies by the inverse."""
     if isinstance(x, np.ndarray):

@@ -285,7 +285,10 @@ def test_what_cannot_be_a_colony_is_refused():
             {"bodies": bodies | {"seeds": ["core"] * 6}},
             "birth.initial: expected at least as many as bodies.seeds (6)",
         ),
-        ({"birth": {"initial": 9, "radius": 1.0}}, "expected at most evolution.population_size (8"),
+        (
+            {"birth": {"initial": 9, "radius": 1.0}},
+            "birth.initial: expected at most evolution.population_size (8); found 9",
+        ),
         ({"look": 5.0}, "look: expected at most the interval (4 s); found 5"),
         ({"arena": {"edge": "wall"}}, "colony.arena.edge: expected"),
         ({"arena": {"size": 2.5, "depth": 1.0}}, "arena.depth: expected more than task.depth (1 m"),

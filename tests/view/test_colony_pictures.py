@@ -84,8 +84,10 @@ def test_births_and_deaths_add_up(history):
 
 SETTINGS = COLONY | {
     "task": COLONY["task"] | {"duration": 0.5, "settle": 0.1},
+    "bodies": {"max_modules": 4, "max_hinges": 2, "brains": {"inheritance": "darwinian"}},
     "colony": COLONY["colony"]
     | {
+        "energy": None,
         "interval": 2.0,
         "look": 0.05,  # as often as pages have poses: one program serves both
         "birth": COLONY["colony"]["birth"] | {"radius": 0.9, "gestation": 2.0},

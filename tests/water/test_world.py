@@ -140,16 +140,24 @@ WRONG = [
     ({"density": math.nan}, "density: expected a number >= 0 [kg/m3]; found nan"),
     ({"densty": 1000}, f"densty: expected one of {count(World)} keys; {UNKNOWN} density?"),
     ({"gravity": (1, 0, -9.8)}, f"{DOWN} (1, 0, -9.8)"),
+    ({"current": (0, "x", 0)}, "current.1: expected a number [m/s]; found 'x'"),
+    ({"buoyancy": "half"}, "buoyancy: expected one of partial, mask, off; found 'half'"),
     ({"drag": "boxes"}, f"drag: expected {drag_names()}; found 'boxes'"),
     (
         {"bed": "sand"},
         "bed: expected 'off', a height in metres or a mapping with kind; found 'sand'",
+    ),
+    ({"bed": {"kind": "hill"}}, "bed.kind: expected one of flat, lake; found 'hill'"),
+    (
+        {"lift_drag": {"cl": 1}},
+        f"lift_drag.cl: expected one of {count(LiftDrag)} keys; {UNKNOWN} lift_drag.cla?",
     ),
     (
         {"shear": {"speed": 3}},
         f"shear.speed: expected one of {fields(Shear)}; found an unknown key "
         "(also wrong or missing: shear.velocity)",
     ),
+    ({"gust": {"std": [1, -2, 0]}}, "gust.std.1: expected a number >= 0 [m/s]; found -2"),
     ({"waves": {"amplitude": 0.1}}, "waves.0: expected either wavelength or period; found none"),
     (
         {"waves": {"amplitude": 0.1, "wavelength": 3, "period": 1}},
@@ -180,7 +188,9 @@ def test_wrong_overrides(override, message):
     ("text", "message"),
     [
         ("", "expected a mapping of world fields; found None"),
+        ("1: 2", "1: expected the name of a setting; found a key that is no text"),
         ("name: 3", "name: expected a text; found 3"),
+        ("density: 1\ndensity: 2", "line 2: expected each key once; found 'density' twice"),
     ],
 )
 def test_wrong_files(tmp_path, text, message):
@@ -285,6 +295,7 @@ GRID = "expected one row for each of 3 x 2 x 2 points of a full grid"
         (["x,y,z,u,v"], "line 1: expected columns x, y, z, u, v, w; found no w"),
         (["x,y,z,u,v,w,x"], "line 1: expected columns x, y, z, u, v, w; found x twice"),
         (["x,y,z,u,v,w", "", "1,2,3,4,5"], "line 3: expected 6 numbers; found 5"),
+        (["x,y,z,u,v,w", "1,2,3,4,5,fast"], "line 2: expected a number; found 'fast'"),
         (["x,y,z,u,v,w", "1,2,3,4,5,nan"], "line 2: expected a finite number; found 'nan'"),
         (["x,y,z,u,v,w", *table()[1:]], f"{GRID}; found 11 rows"),
         (["x,y,z,u,v,w", *table(), table()[5]], f"{GRID}; found (1, -1, -1) twice"),
