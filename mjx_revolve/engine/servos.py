@@ -22,6 +22,7 @@ _MARGIN = 8.0
 # end of the step, by which joints lag. A choice: what it has no time for falls to two thirds in a
 # step.
 _SPRING_DAMPING = 0.2
+_TINY = 1e-12  # [N·m]
 
 
 def servo(
@@ -66,10 +67,12 @@ def servo(
     damping = add(hinges.servo_damping, mul(_SPRING_DAMPING * dt, hinges.implicit_stiffness))
     torque = sub(torque, mul(damping, speed))
     low, high = (_cast(x, torque) for x in hinges.effort)
-    # At its limit, torque does not depend on the angle.
-    free = (torque > low) & (torque < high)
+    # At its limit, torque does not depend on the angle, but the step may lead back below: the
+    # secant of the limited spring. With none of it, light limbs swing from limit to limit for ever.
     square = jnp.asarray((1 + _SPRING_DAMPING) ** 2 / 4 * dt * dt, torque.dtype)
-    yielding = mul(jnp.where(free, square, 0), hinges.implicit_stiffness)
+    limit = jnp.maximum(jnp.where(torque > 0, high, -low), 0)
+    share = jnp.minimum(limit / jnp.maximum(jnp.abs(torque), _TINY), 1)
+    yielding = mul(square * share, hinges.implicit_stiffness)
     torque = jnp.clip(torque, low, high)
     friction, gradient, top = (_cast(x, torque) for x in hinges.motor)
     forward = jnp.sign(torque)

@@ -15,6 +15,7 @@ from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.servos import servo
 from mjx_revolve.engine.single_tree import make_single_tree
+from mjx_revolve.episodes.simulate import simulate
 from mjx_revolve.water.flow import water_of
 from mjx_revolve.water.world import load_world
 
@@ -119,3 +120,18 @@ def test_hinges_that_reverse_together_do_not_push_each_other_far_beyond_the_top_
     ratio = np.where(there, np.abs(speed), 0) / 5.235988
     assert ratio.max() < 1.85
     assert np.quantile(ratio[:, there], 0.5) > 0.3  # they do move
+
+
+@pytest.mark.slow
+def test_light_limbs_come_to_rest_after_jumps_of_their_targets():
+    """At 20 ms, with springs that an explicit step could not hold.
+
+    As servos at their limit forgot their springs, limbs swung from limit to limit for ever, at 3
+    rad/s and more.
+    """
+    robot = build_robot(body("salamander"), load_world("lake", timestep=0.02))
+    jumps = np.random.default_rng(0).uniform(-0.78, 0.78, (8, robot.mj_model.nu))
+    targets = np.concatenate([np.repeat(jumps, 20, 0), np.zeros((150, robot.mj_model.nu))])
+    speeds = np.asarray(simulate(robot, targets, once=True).qvel)[:, 6:]
+    assert np.abs(speeds[:150]).max() > 2
+    assert np.abs(speeds[-50:]).max() < 1e-2
