@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.engine.level import Level, Points
-from mjx_revolve.numerics.inertia import BodyMotion, SpatialInertia, sum_parts
+from mjx_revolve.numerics.inertia import BodyMotion, SpatialInertia, apply_inertia, sum_parts
 from mjx_revolve.numerics.spatial import (
     SYM,
     Mat,
@@ -33,6 +33,7 @@ from mjx_revolve.numerics.spatial import (
     total,
     vadd,
     vscale,
+    vsub,
 )
 from mjx_revolve.water.bed import Bed, bed_height, bed_slope
 from mjx_revolve.water.flow import Water
@@ -69,7 +70,13 @@ def bed_plane(bed: Bed, place: tuple[Scalar, Scalar]) -> tuple[Scalar, Vec]:
 
 
 def bed_contact(
-    bed: Bed, depth: Scalar, normal: Vec, velocity: Vec, point_mass: Scalar, timestep: float
+    bed: Bed,
+    depth: Scalar,
+    normal: Vec,
+    velocity: Vec,
+    point_mass: Scalar,
+    timestep: float,
+    fall: Scalar = 0.0,
 ) -> tuple[Vec, Scalar, Scalar]:
     """Force of the bed on points of the robot, and the damping of its implicit part.
 
@@ -82,7 +89,9 @@ def bed_contact(
     lands is really pushed with, and so much grip would make crawlers a third faster at 5 ms.
 
     Both are linear in the velocity at the end of the step, with the damping that is returned: a
-    body of any mass can rest on a bed of any stiffness.
+    body of any mass can rest on a bed of any stiffness. Whether a point touches is decided with
+    what its weight adds to its speed within the step: without, light parts that lie still lose the
+    bed, fall by a step, and rock for ever.
 
     Args:
         bed: the ground.
@@ -91,6 +100,7 @@ def bed_contact(
         velocity: of the points, same frame [m/s].
         point_mass: m, each point's share of its body's mass [kg]; 0 for padding.
         timestep: dt [s].
+        fall: acceleration at which the point would begin to sink [m/s²], `Points.fall`.
 
     Returns:
         Force on each point, same frame [N], and its damping along the normal and across it [N·s/m].
@@ -101,12 +111,15 @@ def bed_contact(
     else:
         stiffness = mul(bed.stiffness, np.asarray(np.greater(point_mass, 0), np.float64))
     outward = dot(velocity, normal)
-    ahead = jnp.maximum(depth - timestep * outward, 0)
-    damping = mul(mul(_DAMPER_TIME, stiffness), jnp.minimum(ahead / DAMPER_DEPTH, 1))
+    ahead = depth - timestep * outward
+    faded = jnp.clip(ahead / DAMPER_DEPTH, 0, 1)
+    damping = mul(mul(_DAMPER_TIME, stiffness), faded)
     push = sub(mul(stiffness, ahead), damping * outward)
-    touching = (ahead > 0) & (push > 0)
-    push = jnp.where(touching, push, 0)
-    resistance = jnp.where(touching, add(mul(timestep, stiffness), damping), 0)
+    resistance = add(mul(timestep, stiffness), damping)
+    gain = mul(timestep, fall)
+    touching = (ahead + mul(timestep, gain) > 0) & (push + mul(resistance, gain) > 0)
+    push = jnp.where(touching, jnp.maximum(push, 0), 0)
+    resistance = jnp.where(touching, resistance, 0)
     sliding = tuple(v - outward * n for v, n in zip(velocity, normal, strict=True))
     arrest = mul(point_mass / timestep, jnp.maximum(neg(outward), 0))
     borne = jnp.minimum(push, add(mul(stiffness, jnp.maximum(depth, 0)), arrest))
@@ -137,10 +150,14 @@ def bed_forces(
     def gather(x: Scalar) -> Scalar:
         return sum_parts(wide(x), k)
 
+    damping = _damping(points.position, normal, stiff - grip, grip, gather)
+    # What the damping acts on is the acceleration relative to the bed, not to the water.
+    gust = vscale(world.timestep, matTvec(motion.axes, water.acceleration))
+    gust_torque, gust_force = apply_inertia(damping, (0.0, 0.0, 0.0), gust)
     return (
-        tuple(gather(x) for x in torque),
-        tuple(gather(x) for x in force),
-        _damping(points.position, normal, stiff - grip, grip, gather),
+        vsub(tuple(gather(x) for x in torque), gust_torque),
+        vsub(tuple(gather(x) for x in force), gust_force),
+        damping,
     )
 
 
@@ -173,18 +190,17 @@ def _at_points(
         return jnp.broadcast_to(x, (k, n, lanes))
 
     assert world.bed is not None  # there are points only above a bed
-    rows = (motion.x_axis, motion.y_axis, motion.z_axis)
     ground, normal = bed_plane(world.bed, motion.xy)
-    normal = matTvec(rows, normal)
+    normal = matTvec(motion.axes, normal)
     # Depth of the body's origin below the tangent plane, then of each point.
     origin = mul(sub(ground, motion.height), dot(normal, motion.z_axis))
     depth = wide(sub(origin, dot(normal, points.position)))
     velocity = vadd(motion.velocity, cross(motion.angular_velocity, points.position))
-    for speed, axis in zip(water.current, rows, strict=True):
+    for speed, axis in zip(water.current, motion.axes, strict=True):
         velocity = vadd(velocity, vscale(speed, axis))
     wide_normal, velocity = tuple(wide(x) for x in normal), tuple(wide(x) for x in velocity)
     force, stiff, grip = bed_contact(
-        world.bed, depth, wide_normal, velocity, points.mass, world.timestep
+        world.bed, depth, wide_normal, velocity, points.mass, world.timestep, points.fall
     )
     return force, stiff, grip, normal, wide
 

@@ -215,11 +215,13 @@ class Points:
         count: npoint, how many a body has.
         position: body frame [m].
         mass: each point's share of its body's mass [kg]; 0 for padding.
+        fall: acceleration at which its body or the robot would begin to sink in water [m/s²].
     """
 
     count: int = field(metadata={"static": True})
     position: Vec
     mass: Scalar
+    fall: Scalar
 
 
 @jax.tree_util.register_dataclass

@@ -20,9 +20,11 @@ from mjx_revolve.engine.assembly import Assembly, assemble
 from mjx_revolve.engine.edited_model import check_edit, edited_assembly
 from mjx_revolve.engine.fluid_table import FluidTable
 from mjx_revolve.engine.mujoco_model import compile_model
+from mjx_revolve.engine.step_constants import inertia_boxes
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.packages import check_package
 from mjx_revolve.water.drag import find_drag_law
+from mjx_revolve.water.laws import BodyDragLaw
 from mjx_revolve.water.world import World
 
 
@@ -331,13 +333,16 @@ def check_timestep(robot: Robot, engine: str = "population") -> None:
         )
     table, world, assembly = robot.fluid, robot.world, robot.assembly
     explicit = np.array([find_drag_law(name).explicit for name in table.drag])
+    areas = np.bincount(table.body, explicit * table.face_area.max(-1), len(assembly.mass))
+    if isinstance(find_drag_law(world.drag), BodyDragLaw):
+        areas = np.sort(inertia_boxes(assembly)[0])[:, 1:].prod(1)
     longest: list[tuple[float, float, str]] = []
     for body in np.unique(table.body[explicit]):
         rows = explicit & (table.body == body)
         mass = assembly.mass[body] + world.density * table.carried_mass[rows].min(-1).sum()
         # Twice ½ C_d A v, the derivative of the force by the speed: both laws have a C_d of 1,
         # whatever the parts' coefficients are.
-        derivative = world.density * table.face_area[rows].max(-1).sum() * _REFERENCE_SPEED
+        derivative = world.density * areas[body] * _REFERENCE_SPEED
         longest.append((2 * mass / max(derivative, 1e-30), mass, assembly.names[body]))
     most, mass, name = min(longest, default=(np.inf, 0.0, ""))
     if world.timestep > most:

@@ -66,7 +66,7 @@ class StepConstants(NamedTuple):
         bodies: `[nbody]` mass, moment and inertia, and the inertia box or None.
         bounds: `[nbody]` of the drag's gradient.
         parts: `[npart + 1]` a `Parts` of all laws, in the order of the fluid table.
-        points: `[npoint + 1]` (position, mass share), or None without a bed.
+        points: `[npoint + 1]` (position, mass share, `Points.fall`), or None without a bed.
         laws: those that parts obey, in order.
         part_laws: `[npart]` which of them each part obeys.
         part_body: `[npart]` bodies that carry them, as `Assembly` numbers them.
@@ -152,7 +152,11 @@ def read_constants(assembly: Assembly, pairs: np.ndarray = _NO_PAIRS) -> StepCon
         place = turned(frame[touching].swapaxes(1, 2), place)
         share = assembly.mass / np.maximum(np.bincount(touching, minlength=count), 1)
         # A padded point has no mass, so its spring, damper and friction vanish.
-        points = (_vec(_end(place, 0.0)), _end(share[touching], 0.0))
+        points = (
+            _vec(_end(place, 0.0)),
+            _end(share[touching], 0.0),
+            _end(_falls(assembly)[touching], 0.0),
+        )
     pushing = np.zeros(len(table.volume), bool)
     pushing[assembly.thruster_row] = True
     columns = table.buoyancy, table.drag, pushing.tolist(), table.coupled.tolist()
@@ -177,6 +181,18 @@ def read_constants(assembly: Assembly, pairs: np.ndarray = _NO_PAIRS) -> StepCon
         point_body=touching,
         frame=frame,
     )
+
+
+def _falls(assembly: Assembly) -> np.ndarray:
+    """`[nbody]` acceleration at which each body, or its whole robot, would begin to sink [m/s²]."""
+    table, world = assembly.fluid, assembly.world
+    lifts = np.array([find_buoyancy_law(law).lifts for law in table.buoyancy], bool)
+    lifted = np.bincount(table.body, world.density * table.volume * lifts, len(assembly.mass))
+    fallen = []
+    for owner in (np.arange(len(assembly.mass)), assembly.robot + 1):
+        mass, float_ = (np.bincount(owner, x) for x in (assembly.mass, lifted))
+        fallen.append((world.gravity * (1 - float_ / np.maximum(mass, 1e-12)))[owner])
+    return np.maximum(np.maximum(*fallen), 0.0)
 
 
 def hinge_frames(assembly: Assembly) -> np.ndarray:
@@ -291,12 +307,23 @@ def _read_bodies(assembly: Assembly, frame: np.ndarray) -> tuple[Any, ...]:
     inertia = back @ assembly.inertia @ frame - mass[:, None, None] * (x @ x)
     box = None
     if isinstance(find_drag_law(assembly.world.drag), BodyDragLaw):
-        # MuJoCo: a uniform box of the same mass and principal inertia.
-        i, axes = _principal(assembly)
-        edges = np.maximum(i[:, [1, 0, 0]] + i[:, [2, 2, 1]] - i, 0)
-        size = np.sqrt(6 * edges / np.maximum(mass, 1e-30)[:, None])
+        size, axes = inertia_boxes(assembly)
         box = InertiaBox(_mat(back @ axes), _vec(center), _vec(size))
     return mass.copy(), _vec(mass[:, None] * center), _sym(inertia), box
+
+
+def inertia_boxes(assembly: Assembly) -> tuple[np.ndarray, np.ndarray]:
+    """MuJoCo's inertia boxes: uniform, of the bodies' masses and principal inertias.
+
+    Args:
+        assembly: of the robots.
+
+    Returns:
+        Edges `[nbody, 3]` [m] and axes `[nbody, 3, 3]`, body frame.
+    """
+    i, axes = _principal(assembly)
+    edges = np.maximum(i[:, [1, 0, 0]] + i[:, [2, 2, 1]] - i, 0)
+    return np.sqrt(6 * edges / np.maximum(assembly.mass, 1e-30)[:, None]), axes
 
 
 def _principal(assembly: Assembly) -> tuple[np.ndarray, np.ndarray]:
@@ -504,8 +531,7 @@ def select_bodies(
         groups.append(replace(picked, laws=laws, count=index.shape[-2]))
     touching = None
     if points is not None and columns.points is not None:
-        place, share = jax.tree.map(take(points), columns.points)
-        touching = Points(points.shape[-2], place, share)
+        touching = Points(points.shape[-2], *jax.tree.map(take(points), columns.points))
     boxes = None
     if shells is not None:
         own = columns.parts

@@ -192,3 +192,19 @@ def test_a_coefficient_out_of_its_bounds_or_of_no_law_is_an_error(linear):
     ):
         with pytest.raises(InputError, match=text):
             world(drag="linear", coefficients=given)
+
+
+def test_a_step_is_refused_by_the_inertia_box_itself():
+    """Ballast far outside makes a box much larger than the parts' faces, and so does its drag."""
+    for ballast, refused in ((0.0, False), (0.02, True)):
+        robot = box_robot(
+            (0.089, 0.089, 0.045), 0.09, world(drag="inertia_box", timestep=0.01), 5e-5,
+            ballast_mass=ballast, ballast_position=(0.0, 0.0, -0.3),
+        )  # fmt: skip
+        if not refused:
+            check_timestep(robot)
+            continue
+        with pytest.raises(
+            InputError, match=r"timestep: expected at most 0\.0067 s, as drag: inertia_box"
+        ):
+            check_timestep(robot)
