@@ -175,7 +175,10 @@ def main(argv: list[str] | None = None) -> int:
         rows.append((row["engine"], str(row["population"]), *rates))
     print("\n".join(align(rows)))
     folder = make_folder(options.out, "gpu")
-    numbers = {"platform": device.platform, "robot": options.robot, "rows": found}
+    done, missing = ([row for row in found if ("error" in row) == bad] for bad in (False, True))
+    numbers = {
+        "platform": device.platform, "robot": options.robot, "rows": done, "missing": missing
+    }  # fmt: skip
     print(f"written: {write_results('gpu', numbers, (0,), folder)}")
     return 0
 

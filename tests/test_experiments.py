@@ -1,5 +1,7 @@
 """The experiments: their closed forms, what they read from the thesis's data, their options."""
 
+import json
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -180,3 +182,15 @@ def test_advantages_by_hand():
     # the later one's advantage.
     assert found[:, 1].tolist() == [0.5 + 0.25 * 3.0, 2.0 + 0.25 * 4.0, 4.0]
     assert found[:, 0].tolist() == [0.5 + 0.25 * 1.0, 1.0, 4.0]
+
+
+@pytest.mark.long
+def test_on_a_cpu_the_gpus_programs_run_without_our_annotations(tmp_path, monkeypatch):
+    monkeypatch.setenv("MJX_REVOLVE_FUSE", "0")
+    small = ["--robot", "core", "--population", "8", "--steps", "4", "--rounds", "1"]
+    assert gpu.main([*small, "--out", str(tmp_path)]) == 0
+    numbers = json.loads((tmp_path / "gpu.json").read_text())["numbers"]
+    measured, missing = ({row["engine"] for row in numbers[k]} for k in ("rows", "missing"))
+    assert measured | missing == set(gpu.ENGINES)
+    assert measured >= {"ours, no water", "ours, default water"}
+    assert all(row["steps_per_second"] > 0 for row in numbers["rows"])
