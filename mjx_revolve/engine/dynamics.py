@@ -148,18 +148,16 @@ def accelerate(
             return found, submerged, 0.0
         block, bias = _unflatten(found, symmetric)
         angle, speed, target = rest
-        load, inertia = _passive(level.hinges, angle, speed, dt)
         axis = axis_of(motion)
         column = apply_block(block, *axis)
-        moved_inertia, moved_load = add(column[0][2], inertia), sub(load, bias[0][2])
-        motor, motor_inertia = servo(
-            level.hinges, angle, speed, target, dt, moved_inertia, moved_load
+        motor, load, inertia = _at_hinges(
+            level.hinges, angle, speed, target, dt, column[0][2], neg(bias[0][2])
         )
         block, bias, joint = eliminate_joint(
             block,
             bias,
             column,
-            add(inertia, motor_inertia),
+            inertia,
             add(motor, load),
             _coriolis(turning(motion), speed),
             symmetric,
@@ -446,11 +444,27 @@ def _inertia_and_bias(
     return block, (vsub(bias[0], torque), vsub(bias[1], force))
 
 
-def _passive(hinges: Hinges, angle: Scalar, speed: Scalar, dt: float) -> tuple[Scalar, Scalar]:
-    """Torque of friction and end stops, and what is implicit of it, with the armature."""
-    stop, stop_inertia = end_stop(hinges, angle, speed, dt)
-    inertia = add(hinges.armature, add(mul(dt, hinges.damping), stop_inertia))
-    return sub(stop, mul(hinges.damping, speed)), inertia
+def _at_hinges(
+    hinges: Hinges,
+    angle: Scalar,
+    speed: Scalar,
+    target: Scalar,
+    dt: float,
+    moved: Scalar,
+    push: Scalar,
+) -> tuple[Scalar, Scalar, Scalar]:
+    """Torque of the motors, of friction with end stops, and what is implicit, with the armature.
+
+    `moved` and `push` are inertia and torque of the bodies that a hinge moves.
+    """
+    friction = mul(hinges.damping, speed)
+    inertia = add(hinges.armature, mul(dt, hinges.damping))
+    load = sub(push, friction)
+    motor, more = servo(hinges, angle, speed, target, dt, add(moved, inertia), load)
+    inertia = add(inertia, more)
+    gain = mul(dt, add(motor, load) / add(moved, inertia))
+    stop, more = end_stop(hinges, angle, speed, dt, gain)
+    return motor, sub(stop, friction), add(inertia, more)
 
 
 def _coriolis(velocity: tuple[Vec, Vec], speed: Scalar) -> tuple[Vec, Vec]:

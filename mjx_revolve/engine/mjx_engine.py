@@ -475,9 +475,7 @@ def _add_servos(
     v, hinges = plan.columns[level - 1], plan.tree.all[level].hinges
     assert hinges is not None
     angle, speed = flow.qpos[v + 1][:, None], flow.qvel[v][:, None]
-    torque, inertia = end_stop(hinges, angle, speed, plan.dt)
-    force = matrices.force.at[v].add(torque[:, 0])
-    mass = matrices.mass.at[v, v].add(inertia[:, 0])
+    mass, force = matrices
     moved_inertia, load = [], []
     jacobian_of, _ = _jacobians(plan, model, data, level)
     for j, jacobian, drifting in zip(v, jacobian_of, flow.drift[level], strict=True):
@@ -490,16 +488,12 @@ def _add_servos(
         # There the hinge's body is held without acceleration, J̇ q̇ included.
         held = jnp.linalg.solve(jacobian[:, :6], drifting)
         load.append(load_j + row[:6] @ held)
-    motor, motor_inertia = servo(
-        hinges,
-        angle,
-        speed,
-        ctrl[v - 6][:, None],
-        plan.dt,
-        jnp.stack(moved_inertia)[:, None],
-        jnp.stack(load)[:, None],
-    )
-    found = _Matrices(mass.at[v, v].add(motor_inertia[:, 0]), force.at[v].add(motor[:, 0]))
+    moved, push = jnp.stack(moved_inertia)[:, None], jnp.stack(load)[:, None]
+    motor, inertia = servo(hinges, angle, speed, ctrl[v - 6][:, None], plan.dt, moved, push)
+    gain = plan.dt * (motor + push) / (moved + inertia)
+    stop, stop_inertia = end_stop(hinges, angle, speed, plan.dt, gain)
+    implicit, torque = (inertia + stop_inertia)[:, 0], (motor + stop)[:, 0]
+    found = _Matrices(mass.at[v, v].add(implicit), force.at[v].add(torque))
     return found, jnp.sum(jnp.abs(motor * speed))
 
 

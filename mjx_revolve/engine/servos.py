@@ -57,7 +57,7 @@ def servo(
         target: `[nbody, lanes]` [rad].
         dt: for which the line is implicit [s]; 0 for none.
         inertia: that the hinge moves, its parent held still, with all that is implicit [kg·m²].
-        load: torque of all but the motor [N·m].
+        load: torque of all but the motor and the end stops [N·m].
 
     Returns:
         Torque [N·m] and inertia [kg·m²], `[nbody, lanes]`.
@@ -119,18 +119,23 @@ def _cast(x: Scalar, like: jax.Array) -> Scalar:
     return x if isinstance(x, jax.Array) else np.asarray(x, like.dtype)
 
 
-def end_stop(hinges: Hinges, angle: Scalar, speed: Scalar, dt: float) -> tuple[Scalar, Scalar]:
+def end_stop(
+    hinges: Hinges, angle: Scalar, speed: Scalar, dt: float, gain: Scalar = 0.0
+) -> tuple[Scalar, Scalar]:
     """Torque of the joint's end stops, and what an implicit step adds to the joint's inertia.
 
     A spring with a damper, both of which act on angle and speed at the end of the step: linearly
     implicit, so stable at any stiffness (cf. MuJoCo's soft limit constraint, which it stands in
     for). The damper lets go within `STOP_TIME`: hinges arrive and stay, they do not bounce.
+    Whether a hinge is at its end is decided with the speed that it gains within the step: without,
+    what is pressed there loses the stop, and trembles.
 
     Args:
         hinges: their numbers.
         angle: q `[nbody, lanes]` [rad].
         speed: q̇ `[nbody, lanes]` [rad/s].
         dt: for which it is implicit [s]; 0 for none.
+        gain: of speed within the step without stops [rad/s].
 
     Returns:
         Torque [N·m] and inertia [kg·m²], `[nbody, lanes]`.
@@ -138,9 +143,11 @@ def end_stop(hinges: Hinges, angle: Scalar, speed: Scalar, dt: float) -> tuple[S
     low, high = (_cast(x, angle) for x in hinges.range)
     ahead = angle + dt * speed
     over = jnp.maximum(ahead - high, 0) - jnp.maximum(low - ahead, 0)
+    soon = ahead + dt * gain
+    at_end = (soon > high) | (soon < low)
     stop = _cast(hinges.stop, angle)
     # The damper never holds a hinge that swings back.
     outward = jnp.where(over * speed > 0, speed, 0)
-    torque = -stop * (over + STOP_TIME * outward)
+    torque = jnp.where(at_end, -stop * (over + STOP_TIME * outward), 0)
     stiff = jnp.where(over * speed > 0, dt + STOP_TIME, dt)
-    return torque, jnp.where(over != 0, dt * stop * stiff, jnp.zeros_like(angle))
+    return torque, jnp.where(at_end, dt * stop * stiff, jnp.zeros_like(angle))

@@ -149,6 +149,18 @@ def test_a_hinge_ends_where_its_neighbours_meet():
     assert np.all(np.abs(np.abs(angle) - high[0]) < 0.02)
 
 
+@pytest.mark.parametrize("timestep", [0.0125, 0.02])
+def test_a_hinge_that_is_pressed_against_its_end_lies_still(timestep):
+    """At long steps it lost its stop for what the servo adds to its speed within the step, and
+    trembled at .5 rad/s."""
+    robot = build_robot(fork(1, 0), load_world("lake", bed=None, timestep=timestep))
+    targets = np.array([[0.78, -0.78, 0.78, 0.6], [-0.78, 0.78, 0.78, -0.6]])
+    _, qpos, qvel, _ = march(robot, 4.0, *at_rest(robot, 4, -2.0), targets)
+    assert np.abs(qvel[-40:, 6:]).max() < 1e-3
+    low, high = robot.assembly.stops[robot.assembly.moved].T
+    assert qpos[-1, 7:] == pytest.approx(np.clip(targets.T, low, high).T, abs=0.02)
+
+
 def one_step(robot, qpos, qvel, ctrl):
     return march(robot, robot.world.timestep, qpos, qvel, ctrl)[2][0]
 
