@@ -32,8 +32,8 @@ from mjx_revolve.engine.step_constants import (
 )
 from mjx_revolve.engine.thrusters import curve_points, read_thrusters
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.water.drag import find_drag_law
-from mjx_revolve.water.laws import BodyDragLaw, part_fields
+from mjx_revolve.water.drag import drags_whole_bodies
+from mjx_revolve.water.laws import part_fields
 from mjx_revolve.water.world import World
 
 # What a row costs in a step beside its parts, in parts [-]; measured, alike under both drag laws.
@@ -297,7 +297,7 @@ def fit_capacity(
     columns, world = read_constants(assembly, meeting), robots[0].world
     carries = columns.parts.carried is not None
     sizes = _sizes(assembly, columns)
-    if modules and _drags_whole_bodies(world):
+    if modules and drags_whole_bodies(world.drag):  # no part may overflow
         sizes = _widest_bodies(assembly, columns, sizes, modules)
     types = {m.kind.name: m.kind for r in robots for m in r.morphology.modules}
     types |= {kind.name: kind for kind in kinds}
@@ -368,7 +368,8 @@ def _choose_groups(
     """
     most = {laws: int(sizes.parts[laws].max()) for laws in every}
     most_root = {laws: int(sizes.root_parts[laws].max()) for laws in every}
-    whole = _drags_whole_bodies(assembly.world)
+    # Drag and submerged share are of a body as a whole: no part may overflow into another row.
+    whole = drags_whole_bodies(assembly.world.drag)
     least = max(1, *most.values()) if whole and most else 1
     widest = max(1, *most_root.values()) if most_root else 1
     on_root = [widest]
@@ -394,11 +395,6 @@ def _choose_groups(
                 best = (cost, groups, order)
     assert best is not None
     return best[1], best[2]
-
-
-def _drags_whole_bodies(world: World) -> bool:
-    """Whether no part may overflow into another row: drag and submerged share are of a body."""
-    return isinstance(find_drag_law(world.drag), BodyDragLaw)
 
 
 def _widest_bodies(
@@ -785,7 +781,7 @@ def _check_fit(
             raise InputError(
                 f"robot {names[k]!r}: expected at most {most} {what}; found {counts[k]}"
             )
-    if _drags_whole_bodies(assembly.world) and np.any(order.overflow):
+    if drags_whole_bodies(assembly.world.drag) and np.any(order.overflow):
         k = int(np.argmax(order.overflow))
         raise InputError(
             f"robot {names[order.robot[k]]!r}: expected at most as many parts on a body as the "

@@ -23,8 +23,7 @@ from mjx_revolve.engine.mujoco_model import compile_model
 from mjx_revolve.engine.step_constants import inertia_boxes
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.packages import check_package
-from mjx_revolve.water.drag import find_drag_law
-from mjx_revolve.water.laws import BodyDragLaw
+from mjx_revolve.water.drag import drags_whole_bodies, find_drag_law
 from mjx_revolve.water.world import World
 
 
@@ -333,9 +332,10 @@ def check_timestep(robot: Robot, engine: str = "population") -> None:
         )
     table, world, assembly = robot.fluid, robot.world, robot.assembly
     explicit = np.array([find_drag_law(name).explicit for name in table.drag])
-    areas = np.bincount(table.body, explicit * table.face_area.max(-1), len(assembly.mass))
-    if isinstance(find_drag_law(world.drag), BodyDragLaw):
+    if drags_whole_bodies(world.drag):
         areas = np.sort(inertia_boxes(assembly)[0])[:, 1:].prod(1)
+    else:
+        areas = np.bincount(table.body, explicit * table.face_area.max(-1), len(assembly.mass))
     longest: list[tuple[float, float, str]] = []
     for body in np.unique(table.body[explicit]):
         rows = explicit & (table.body == body)

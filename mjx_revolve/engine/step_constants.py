@@ -34,9 +34,8 @@ from mjx_revolve.numerics.inertia import SpatialInertia
 from mjx_revolve.numerics.spatial import SYM, clean
 from mjx_revolve.water.added_mass import CarriedWater
 from mjx_revolve.water.buoyancy import find_buoyancy_law
-from mjx_revolve.water.drag import find_drag_law
+from mjx_revolve.water.drag import drags_whole_bodies, find_drag_law
 from mjx_revolve.water.laws import (
-    BodyDragLaw,
     DragLaw,
     PartDragLaw,
     PartField,
@@ -190,8 +189,8 @@ def _falls(assembly: Assembly) -> np.ndarray:
     lifted = np.bincount(table.body, world.density * table.volume * lifts, len(assembly.mass))
     fallen = []
     for owner in (np.arange(len(assembly.mass)), assembly.robot + 1):
-        mass, float_ = (np.bincount(owner, x) for x in (assembly.mass, lifted))
-        fallen.append((world.gravity * (1 - float_ / np.maximum(mass, 1e-12)))[owner])
+        mass, lift = (np.bincount(owner, x) for x in (assembly.mass, lifted))
+        fallen.append((world.gravity * (1 - lift / np.maximum(mass, 1e-12)))[owner])
     return np.maximum(np.maximum(*fallen), 0.0)
 
 
@@ -306,7 +305,7 @@ def _read_bodies(assembly: Assembly, frame: np.ndarray) -> tuple[Any, ...]:
     x = _skews(center)
     inertia = back @ assembly.inertia @ frame - mass[:, None, None] * (x @ x)
     box = None
-    if isinstance(find_drag_law(assembly.world.drag), BodyDragLaw):
+    if drags_whole_bodies(assembly.world.drag):
         size, axes = inertia_boxes(assembly)
         box = InertiaBox(_mat(back @ axes), _vec(center), _vec(size))
     return mass.copy(), _vec(mass[:, None] * center), _sym(inertia), box
@@ -405,7 +404,7 @@ def _read_parts(assembly: Assembly, frame: np.ndarray, drag: Mapping[str, Any]) 
     # The part's axes in the frame that describes it: the body's where both have the same.
     square = np.all((turn == 0) | (np.abs(turn) == 1), (1, 2))
     swap = np.where(square[:, None, None], turn, np.eye(3))
-    whole = isinstance(find_drag_law(world.drag), BodyDragLaw)
+    whole = drags_whole_bodies(world.drag)
     numbers: dict[str, Any] = dict(
         position=position,
         rotation=turn @ swap.swapaxes(1, 2),

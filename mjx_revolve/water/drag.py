@@ -9,7 +9,7 @@ from mjx_revolve.water.cross_flow import CROSS_FLOW
 from mjx_revolve.water.face_drag import FACES
 from mjx_revolve.water.fin_wake import FIN_WAKE
 from mjx_revolve.water.fossen import FOSSEN
-from mjx_revolve.water.laws import DragLaw, Export, PartDragLaw, find_law
+from mjx_revolve.water.laws import BodyDragLaw, DragLaw, Export, PartDragLaw, find_law
 from mjx_revolve.water.lift_drag import LIFT_DRAG
 from mjx_revolve.water.mujoco_drag import ELLIPSOID, INERTIA_BOX
 from mjx_revolve.water.plate_wake import PLATE_WAKE
@@ -44,3 +44,8 @@ DRAG_LAWS: dict[str, DragLaw] = {
 def find_drag_law(name: str) -> DragLaw:
     """The drag law of a name; an unknown one is an `InputError`."""
     return find_law(DRAG_LAWS, name)
+
+
+def drags_whole_bodies(name: str) -> bool:
+    """Whether the drag law of a name acts on a moving body as a whole, not on its parts."""
+    return isinstance(find_drag_law(name), BodyDragLaw)

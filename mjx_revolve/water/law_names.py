@@ -21,10 +21,9 @@ if TYPE_CHECKING:
 
 def drag_names(of_parts: bool = False) -> str:
     """The drag laws that a world can choose, or a part of a module, in words."""
-    from mjx_revolve.water.drag import DRAG_LAWS
-    from mjx_revolve.water.laws import BodyDragLaw
+    from mjx_revolve.water.drag import DRAG_LAWS, drags_whole_bodies
 
-    whole = [name for name, law in DRAG_LAWS.items() if isinstance(law, BodyDragLaw)]
+    whole = [name for name in DRAG_LAWS if drags_whole_bodies(name)]
     if not of_parts:
         return f"one of {', '.join(DRAG_LAWS)}"
     own = ", ".join(name for name in DRAG_LAWS if name not in whole)
