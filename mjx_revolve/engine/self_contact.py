@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mjx_revolve.engine.kinematics import BodyFrames
 from mjx_revolve.engine.meetings import Meetings
@@ -40,7 +41,7 @@ from mjx_revolve.numerics.boxes import (
     weight,
 )
 from mjx_revolve.numerics.spatial import cross
-from mjx_revolve.numerics.xla import fuse, materialize, take_lanes
+from mjx_revolve.numerics.xla import fuse, materialize, on_cpu, take_lanes
 
 # Contacts of one robot at a time. A choice: few robots have more.
 _MOST = 8
@@ -107,7 +108,8 @@ def contact_acceleration(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Accelerations of robots by contacts of their own modules.
 
-    Only robots are looked at that have used up their clearance, a few at a time.
+    Only robots are looked at that have used up their clearance, a few at a time. Where XLA has no
+    CPU, a kernel takes as long for one robot as for all: there all are looked at when one has.
 
     Args:
         meetings: which boxes can meet.
@@ -142,7 +144,14 @@ def contact_acceleration(
 
         return _repeat(-(-count // size), most, visit, start, steady)
 
-    found: jax.Array = jax.lax.cond(any_lane(wanted), fuse(look), lambda: start)
+    def look_at_all() -> Any:
+        which = jnp.arange(lanes, dtype=jnp.int32)
+        solved = _settle(meetings, which, wanted, look_at(which), rows, dt, felt)
+        return jnp.where(wanted, solved, start)
+
+    found: jax.Array = jax.lax.cond(
+        any_lane(wanted), fuse(look) if on_cpu() else look_at_all, lambda: start
+    )
     return found[:rows], found[rows], found[rows + 1 :]
 
 
@@ -162,7 +171,7 @@ def _settle(
     and join those that push.
     """
     size, steps = len(which), robots.steps
-    bodies = 1 + len(steps)
+    bodies, find = 1 + len(steps), _find_contacts if on_cpu() else _find_at_once
     halves = felt > bodies
     zeros = lambda *shape: jnp.zeros((*shape, size), steps.dtype)  # noqa: E731
     none = _Contacts(
@@ -179,12 +188,12 @@ def _settle(
         change = contacts.acceleration()[6:] - first * robots.hurry
         frames = robots.pose(steps + dt**2 * change)
         kept = weight(contacts.force > 0, clear)
-        table = _find_contacts(meetings, which, moving > 0, frames, kept, dt, halves)
+        table = find(meetings, which, moving > 0, frames, kept, dt, halves)
         near = -first * robots.drift / dt**2
         touches = _largest(weight((table.need > near) & (table.need < _KEPT), kept)) > 0
 
         def resolve() -> Any:
-            found = contacts.join(table, frames[1], robots, change, dt)
+            found = contacts.join(table, frames[1], robots, change, dt, meetings.steady)
             turned = _largest(jnp.abs(found.acceleration()[6:] - change))
             return found, weight(dt**2 * turned > _TURN, clear)
 
@@ -194,11 +203,8 @@ def _settle(
         clear = first * (table.clear - robots.drift) + (1 - first) * clear
         return found, clear, moving, jnp.zeros_like(first)
 
-    def step(_: Any, now: Any) -> Any:
-        return jax.lax.cond(any_lane(now[2] > 0), look_again, lambda x: x, now)
-
     start = none, zeros(), weight(real, steps), jnp.ones_like(steps[0])
-    contacts, clear, *_ = _loop(_ROUNDS, step, start)
+    contacts, clear, *_ = _while_any(2, _ROUNDS, look_again, start, meetings.steady)
     found = [contacts.acceleration(), clear[None]]
     if contacts.ends is not None:
         row = jnp.arange(felt, dtype=steps.dtype)[:, None]
@@ -237,11 +243,31 @@ def _repeat(count: Any, most: int, body: Any, carry: Any, steady: bool) -> Any:
     return _loop(most, step, carry)
 
 
+def _while_any(
+    going: int, most: int, body: Callable[[Any], Any], carry: tuple[Any, ...], steady: bool
+) -> Any:
+    """At most so many rounds, as long as any lane goes on: this part of the carry is positive."""
+    if steady or on_cpu():
+
+        def step(_: Any, carry: Any) -> Any:
+            return jax.lax.cond(any_lane(carry[going] > 0), body, lambda x: x, carry)
+
+        return _loop(most, step, carry)
+    # The host waits for each condition: there are no more of them than rounds.
+    wanted = lambda x: (x[0] < most) & any_lane(x[1][going] > 0)  # noqa: E731
+    return jax.lax.while_loop(wanted, lambda x: (x[0] + 1, body(x[1])), (0, carry))[1]
+
+
 def append_true(flags: jax.Array, values: jax.Array, found: Any, steady: bool) -> Any:
     """A list with room for one more, and its length, with the values `[n]` where flags are set.
 
     `steady` loops have a known length, so that they have derivatives.
     """
+    if not on_cpu():
+        listed, count = found
+        ends = count + jnp.cumsum(flags, dtype=jnp.int32)
+        places = jnp.where(flags, ends - 1, len(listed))
+        return listed.at[places].set(values, mode="drop"), ends[-1]
 
     def write(k: Any, found: Any) -> Any:
         new = jax.lax.dynamic_slice(values, (k,), (1,))
@@ -406,6 +432,53 @@ def _find_contacts(
     return table._replace(clear=jnp.minimum(clear, table.clear))
 
 
+def _find_at_once(
+    meetings: Meetings,
+    _: jax.Array,
+    real: jax.Array,
+    poses: tuple[BodyFrames, BodyFrames],
+    kept: jax.Array,
+    dt: float,
+    halves: bool,
+) -> ContactTable:
+    """As `_find_contacts`, of all robots: all their pairs are measured side by side."""
+    size, dtype = kept.shape[-1], kept.dtype
+    frames = jnp.stack([jnp.asarray(x, dtype) for x in jax.tree.leaves(poses)])
+    shapes = meetings.shapes[:-1].reshape(-1, len(meetings.body), meetings.lanes)
+    body, npair = jnp.asarray(meetings.body, jnp.int32), len(meetings.first)
+    pairs = [
+        jnp.broadcast_to(jnp.asarray(x, jnp.int32), (npair, size))
+        for x in (meetings.first, meetings.second)
+    ]
+
+    def pick(table: jax.Array, row: jax.Array) -> jax.Array:
+        """`[n, npair size]` of `[n, rows, lanes or 1]`."""
+        wide = jnp.broadcast_to(table, (*table.shape[:2], size))
+        return jnp.take_along_axis(wide, row[None], 1).reshape(len(table), -1)
+
+    shown = tuple((pick(frames, body[x]), pick(shapes, x)) for x in pairs)
+    need, gap, *units = _measure(shown, dt)
+    found = [*(body[x].reshape(-1).astype(dtype) for x in pairs), *units]
+    if halves:
+        none = np.zeros((len(meetings.body), 5)) if meetings.halves is None else meetings.halves
+        cells = jnp.asarray(none.T, dtype)[..., None]
+        for x, (frame, _shape) in zip(pairs, shown, strict=True):
+            found.append(_half(pick(cells, x), frame[12:], units[3:]))
+    there = real & (pairs[0] != pairs[1])
+    need = jnp.where(there, need.reshape(npair, size), _NONE)
+    gap = jnp.where(there, gap.reshape(npair, size), _FAR)
+    # The contacts that need most, in the places that are not kept.
+    rank = jnp.cumsum(1 - kept, 0).astype(jnp.int32) - 1
+    rank = jnp.pad(rank, ((0, 1), (0, 0)), constant_values=npair)
+    free = jnp.pad(1 - kept, ((0, 1), (0, 0))) * weight(rank < npair, kept)
+    order = jnp.argsort(-need, axis=0)
+    chosen = jnp.take_along_axis(order, jnp.clip(rank, 0, npair - 1), 0)
+    rest = jnp.stack(found).reshape(-1, npair, size)
+    rest = jnp.moveaxis(jnp.take_along_axis(rest, chosen[None], 1), 0, 1) * free[:, None]
+    need = jnp.where(free > 0, jnp.take_along_axis(need, chosen, 0), _NONE)[:_MOST]
+    return ContactTable(jnp.where(kept > 0, _KEPT, need), rest, gap.min(0))
+
+
 class ContactTable(NamedTuple):
     """Contacts of robots.
 
@@ -537,7 +610,13 @@ class _Contacts(NamedTuple):
         return _sum([self.force[k] * self.moved[k] for k in range(_MOST)])
 
     def join(
-        self, table: ContactTable, ahead: BodyFrames, robots: Robots, change: jax.Array, dt: float
+        self,
+        table: ContactTable,
+        ahead: BodyFrames,
+        robots: Robots,
+        change: jax.Array,
+        dt: float,
+        steady: bool,
     ) -> _Contacts:
         """Those that push, with those of a table in the other places, solved.
 
@@ -568,9 +647,9 @@ class _Contacts(NamedTuple):
             own = jnp.concatenate([numbers[:, :2], numbers[:, 8:]], 1)
             bodies = kept[:, None] * bodies + (1 - kept[:, None]) * own
         contacts = _Contacts(need, levers, columns, moved, kept * self.force, bodies)
-        return contacts.solve(robots.make_respond(), dt)
+        return contacts.solve(robots.make_respond(), dt, steady)
 
-    def solve(self, respond: Respond, dt: float) -> _Contacts:
+    def solve(self, respond: Respond, dt: float, steady: bool) -> _Contacts:
         """With the forces of all contacts.
 
         Contacts take part one after the other, the one that misses most first: a column of W is
@@ -598,11 +677,7 @@ class _Contacts(NamedTuple):
             taken = weight(diagonal > 0, diagonal)
             inverse = taken / (diagonal + 1 - taken)
             step = fuse(lambda now: sweep(columns, inverse, now), inline=True)
-
-            def end(_: Any, now: Any) -> Any:
-                return jax.lax.cond(any_lane(now[1] > 0), step, lambda x: x, now)
-
-            found: jax.Array = _loop(_SWEEPS, end, (force, moving))[0]
+            found: jax.Array = _while_any(1, _SWEEPS, step, (force, moving), steady)[0]
             return found
 
         def join(now: Any) -> Any:
@@ -621,12 +696,10 @@ class _Contacts(NamedTuple):
             force = settle(force, columns, wanting)
             return force, columns, moved, *self._missing(force, columns, dt)
 
-        def step(_: Any, now: Any) -> Any:
-            return jax.lax.cond(any_lane(now[-1] > 0), fuse(join, inline=True), lambda x: x, now)
-
         missing = self._missing(self.force, self.columns, dt)
         start = self.force, self.columns, self.moved, *missing
-        force, columns, moved, *_ = _loop(_MOST, step, start)
+        step = fuse(join, inline=True)
+        force, columns, moved, *_ = _while_any(-1, _MOST, step, start, steady)
         return self._replace(force=force, columns=columns, moved=moved)
 
     def _missing(

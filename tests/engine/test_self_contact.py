@@ -289,6 +289,46 @@ def march_batch(robots, capacity, lanes, ctrl, steps):
         return np.asarray(run(bodies, jnp.asarray(ctrl)))
 
 
+@pytest.fixture
+def other_back_end(monkeypatch):
+    """Makes contact what it is where there is no CPU, on this one: its kernels are not fused."""
+
+    def change():
+        monkeypatch.setenv("MJX_REVOLVE_FUSE", "0")
+        monkeypatch.setattr("mjx_revolve.engine.self_contact.on_cpu", lambda: False)
+
+    return change
+
+
+@pytest.mark.slow
+def test_robots_that_are_looked_at_all_at_once_feel_the_same(other_back_end):
+    robot = build_robot(fork(3, 1), water(timestep=0.01))
+    qpos, qvel = open_jaw(robot, 3)
+    qpos[7, 1] = 0.5
+    usual = march(robot, 0.6, qpos, qvel, INWARDS)[1]
+    assert 0 < depths(robot, usual).max() < 1e-3
+    other_back_end()
+    np.testing.assert_allclose(march(robot, 0.6, qpos, qvel, INWARDS)[1], usual, atol=1e-9)
+
+
+@pytest.mark.long
+def test_different_bodies_that_are_looked_at_all_at_once_feel_the_same(other_back_end):
+    """But for what forces are solved to: contacts stand in another order."""
+    world, steps = water(timestep=0.02), 40
+    robots = [build_robot(random_body(k, 4 + k % 9, 6), world) for k in range(100, 112)]
+    capacity = fit_capacity(robots)
+    ctrl = np.zeros((steps, capacity.hinges, 4 * len(robots)))
+    for k, robot in enumerate(robots):
+        ctrl[:, : robot.num_hinges, 4 * k : 4 * k + 4] = random_gaits(robot, 4, steps, k)
+    usual = march_batch(robots, capacity, 4, ctrl, steps)
+    other_back_end()
+    found = march_batch(robots, capacity, 4, ctrl, steps)
+    np.testing.assert_allclose(found[0], usual[0], atol=5e-4)  # 20 µm at the end of 4 cm
+    for k, robot in enumerate(robots):
+        own = found[:, : 7 + robot.num_hinges, 4 * k : 4 * k + 4]
+        assert depths(robot, own).max() < 3e-3
+
+
 def test_contacts_are_mujocos():
     """Which pairs, when, and how deep: MuJoCo's contacts of the same model."""
     draw, seen = np.random.default_rng(0), 0
