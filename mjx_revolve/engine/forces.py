@@ -19,6 +19,7 @@ from mjx_revolve.engine.single_tree import SingleTree, make_single_tree
 from mjx_revolve.engine.state import State, effective_gravity
 from mjx_revolve.engine.step_constants import IMMOBILE_INERTIA
 from mjx_revolve.engine.tree import Tree
+from mjx_revolve.engine.variation import Variation
 from mjx_revolve.numerics.inertia import BodyMotion
 from mjx_revolve.numerics.spatial import (
     Scalar,
@@ -54,7 +55,9 @@ def servo_torque(tree: Tree, state: State, targets: Any) -> Float[Array, "rows l
     return tree.join_rows(found, state.position[0])
 
 
-def motor_torques(robot: Robot, qpos: Any, qvel: Any, ctrl: Any) -> np.ndarray:
+def motor_torques(
+    robot: Robot, qpos: Any, qvel: Any, ctrl: Any, variation: Variation | None = None
+) -> np.ndarray:
     """Torque of the motors along a trajectory, by the servos' law, without the joints' friction.
 
     Args:
@@ -62,11 +65,13 @@ def motor_torques(robot: Robot, qpos: Any, qvel: Any, ctrl: Any) -> np.ndarray:
         qpos: `[S, nq]` configurations.
         qvel: `[S, nv]` velocities.
         ctrl: `[S, nu]` commands.
+        variation: factors on coefficients of the motors, a number each; None for none.
 
     Returns:
         `[S, nhinge]` in the order of the hinges [N·m].
     """
     tree = make_single_tree(robot, contact=False)
+    tree = tree if variation is None else tree.with_variation(variation)
     hinges = (np.asarray(qpos)[:, 7:], np.asarray(qvel)[:, 6:], np.asarray(ctrl)[:, robot.servos])
     angle, speed, targets = (tree.joints_to_tree(jnp.asarray(x.T)) for x in hinges)
     still = (jnp.zeros(len(hinges[0])),) * 3

@@ -24,6 +24,7 @@ from mjx_revolve.control.courses import course_path
 from mjx_revolve.control.readings import EpisodeContext
 from mjx_revolve.engine.engines import Engine
 from mjx_revolve.engine.plant import BodyGeometry
+from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.config import Config, TaskConfig
 from mjx_revolve.episodes.measures import measure
 from mjx_revolve.episodes.rollout import (
@@ -161,6 +162,10 @@ class EpisodeSpec(ABC, Generic[B]):
     def draw_starts(self, key: jax.Array) -> Starts:
         """The starts of a key's episodes, the same for all bodies."""
         return draw_starts(self.settings, self.world, key, self.num_timesteps)
+
+    def variation(self, key: jax.Array, trial: int = 0) -> Variation | None:
+        """The coefficients of one of a key's episodes, as `simulate` takes them; None: as given."""
+        return jax.tree.map(lambda x: x[trial], self.draw_starts(key).variation)
 
     def precise_starts(self, population: jax.Array, key: jax.Array) -> Starts:
         """`draw_starts` in the population's precision."""

@@ -226,10 +226,6 @@ class Fitness(EpisodeSpec[tuple[()]]):
         starts = jax.tree.map(lambda x: x[..., trial], self.draw_starts(key))
         return episode_context(self.settings, starts, self.starts(key)[0][:3, trial])
 
-    def variation(self, key: jax.Array, trial: int = 0) -> Variation | None:
-        """The coefficients of one of a key's episodes, as `simulate` takes them; None: as given."""
-        return jax.tree.map(lambda x: x[trial], self.draw_starts(key).variation)
-
     def starts(self, key: jax.Array) -> tuple[jax.Array, Water | None]:
         """Start poses and water of a key's episodes.
 
@@ -420,8 +416,9 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
             name: np.asarray(x) for name, x in self._trace(bodies, population, key, trials).items()
         }
         source, step = np.asarray(bodies.plant.source), self.trace_every * self.world.timestep
+        varied = self.variation(key, trial)
         return [
-            _own_trajectory(robot, self.capacity, step, source[:, lane], {
+            _own_trajectory(robot, self.capacity, step, source[:, lane], varied, {
                 name: x[..., lane] for name, x in rows.items()
             })
             for lane, robot in enumerate(robots)
@@ -486,8 +483,9 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
 
 
 def _own_trajectory(
-    robot: Robot, capacity: Capacity, step: float, source: np.ndarray, rows: dict[str, np.ndarray]
-) -> Trajectory:
+    robot: Robot, capacity: Capacity, step: float, source: np.ndarray,
+    variation: Variation | None, rows: dict[str, np.ndarray],
+) -> Trajectory:  # fmt: skip
     """The trajectory of one of many robots.
 
     `step`: between rows [s]; `source`: `[n]` actuator of each row of ctrl; `rows`: `[T, ...]` each.
@@ -507,6 +505,7 @@ def _own_trajectory(
         power=jnp.asarray(rows["energy"] / step),
         command=jnp.asarray(rows["command"][:, : robot.num_thrusters]),
         target=None if "target" not in rows else jnp.asarray(rows["target"]),
+        variation=variation,
     )
 
 

@@ -40,7 +40,7 @@ from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.numerics.xla import over_chunks
 from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.drag import find_drag_law
-from mjx_revolve.water.flow import water_of
+from mjx_revolve.water.flow import Water, water_of
 from mjx_revolve.water.world import World
 
 PASSPORT = "champion/passport.yaml"
@@ -199,7 +199,7 @@ def make_passport(fitness: Fitness, genes: Any, seed: int) -> Passport:
     checks = (
         *_swim(fitness, genes, key),
         *joint_checks(fitness.robot, trajectory, fitness.settings.settle),
-        *_energy(fitness, trajectory, replay_key(seed)),
+        *_energy(fitness, trajectory, fitness.water(replay_key(seed))),
     )
     return Passport(dict(checks))
 
@@ -435,29 +435,30 @@ def joint_checks(
     qpos, qvel, ctrl = (
         np.asarray(x)[rows] for x in (trajectory.qpos, trajectory.qvel, trajectory.ctrl)
     )
-    moved, speed = robot.assembly.moved, qvel[:, 6:]
+    moved, varied = robot.assembly.moved, trajectory.variation
     depth = np.abs(1000 * self_overlap(robot, qpos).depth)  # rather than -0
     yield "overlap", Check("deepest overlap of modules", float(depth.max()), "mm", most=OVERLAP)
     deeper = float(np.mean(depth > OVERLAP))
     yield "overlap_time", Check(f"share of time with more than {OVERLAP:g} mm", deeper)
     rate = count_reversals(qpos[:, 7:]).max() / (len(qvel) * step)
     yield "reversals", Check("reversals of a joint", float(rate), "1/s", most=REVERSALS)
-    torque = motor_torques(robot, qpos, qvel, ctrl) / robot.assembly.effort[moved]
+    torque = motor_torques(robot, qpos, qvel, ctrl, varied) / robot.assembly.effort[moved]
     used = float(np.sqrt(np.mean(torque**2, 0)).max())
     yield "torque", Check("share of a servo's torque used, root mean square", used, most=TORQUE)
-    fastest = np.quantile(np.abs(speed) / robot.assembly.speed[moved], _OFTEN, axis=0).max()
+    top = robot.assembly.speed[moved] * (1.0 if varied is None else float(varied.motor))
+    fastest = np.quantile(np.abs(qvel[:, 6:]) / top, _OFTEN, axis=0).max()
     yield "speed", Check(f"share of a servo's speed used, {_OFTEN:.0%} of the time", float(fastest))
 
 
 def _energy(
-    fitness: Fitness, trajectory: Trajectory, key: jax.Array
+    fitness: Fitness, trajectory: Trajectory, water: Water | None
 ) -> Iterator[tuple[str, Check]]:
-    """Whether what the motors give in one episode, drawn by the key, is found again."""
+    """Whether what the motors give in one episode, in such water, is found again."""
     if fitness.config.engine != "population":  # the balance is made of its forces
         return
-    water, variation = fitness.water(key) or water_of(fitness.world), fitness.variation(key)
     rows = trajectory.qpos, trajectory.qvel, trajectory.ctrl, trajectory.command
-    balance = energy_balance(fitness.robot, *rows, water, variation)
+    water = water or water_of(fitness.world)
+    balance = energy_balance(fitness.robot, *rows, water, trajectory.variation)
     if balance is None:
         return
     words = "energy unaccounted for, share of the motors' work"

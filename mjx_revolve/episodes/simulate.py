@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -54,6 +54,7 @@ class Trajectory:
         command: `[T, nthruster]` commands of the thrusters behind their lag [-].
         surface_height: `[T]` z of the still surface, world frame [m]; None for the world's.
         target: `[T, 3]` where the target was, world frame [m]; None without one.
+        variation: factors on coefficients of water and motors, a number each; None for none.
     """
 
     time: jax.Array
@@ -65,6 +66,7 @@ class Trajectory:
     command: jax.Array | None = None
     surface_height: jax.Array | None = None
     target: jax.Array | None = None
+    variation: Variation | None = None
 
     __repr__ = short_repr
 
@@ -235,7 +237,7 @@ def simulate(
         variation = Variation(*(_array("variation", x, ()) for x in variation))
     jitted, plain = _compiled(robot, engine, steps, controller, water is None, once)
     given = qpos, qvel, drive_input, water, context, variation
-    return (plain if is_traced(given) else jitted)(*given)
+    return replace((plain if is_traced(given) else jitted)(*given), variation=variation)
 
 
 def _steps(rows: Any, duration: float | None, dt: float) -> int:

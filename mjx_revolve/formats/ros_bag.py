@@ -150,7 +150,8 @@ def _messages(
     speeds = np.ascontiguousarray(qvel[:, [joint.qvel for joint in joints]])
     targets = np.ascontiguousarray(ctrl[:, [joint.ctrl for joint in joints]])
     # The torque of the motors, without the joints' friction.
-    torques = np.ascontiguousarray(motor_torques(robot, qpos, qvel, ctrl), np.float64)
+    torques = motor_torques(robot, qpos, qvel, ctrl, trajectory.variation)
+    torques = np.ascontiguousarray(torques, np.float64)
     commands = ctrl[:, list(robot.thrusters)]
     if trajectory.command is not None:
         commands = np.asarray(trajectory.command, np.float64)[rows]

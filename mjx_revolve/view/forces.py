@@ -54,7 +54,7 @@ def module_forces(
 
     Args:
         robot: of the trajectory.
-        trajectory: of the robot.
+        trajectory: of the robot, with the coefficients that it was made with.
         every: stride of rows.
         water: as given to `simulate`: surface and current, each a number or a row for each step;
             by default the world's, without its gusts.
@@ -82,6 +82,8 @@ def module_forces(
     time = np.asarray(trajectory.time, float)[rows]
     now = water_at(robot.world, rows, time, count, water)
     levels = make_single_tree(robot)
+    if trajectory.variation is not None:
+        levels = levels.with_variation(trajectory.variation)
 
     def run(qpos: jax.Array, qvel: jax.Array, command: jax.Array, water: Water) -> Any:
         # The rows of the trajectory are the lanes, like a population.

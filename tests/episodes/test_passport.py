@@ -8,6 +8,7 @@ import pytest
 
 from laboratory import OAR, QUICK, body, swimmer
 from mjx_revolve import InputError, make_fitness
+from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes import passport
 from mjx_revolve.episodes.fitness import fit_body
 from mjx_revolve.episodes.passport import Check, Passport, count_reversals, load_passport
@@ -113,6 +114,24 @@ def test_a_robot_that_folds_into_itself_and_chatters_fails(tmp_path):
     assert {"overlap", "reversals"} <= set(bad.failed)
     assert bad.checks["overlap"].value > 10 and bad.checks["overlap_time"].value == 1
     assert bad.checks["reversals"].value == pytest.approx(200, rel=0.02)
+
+
+def test_joints_are_judged_by_the_motors_of_the_episode(tmp_path):
+    robot = make_fitness(swimmer(tmp_path, OAR, TASK)).robot
+    (top,), (effort,) = (
+        x[robot.assembly.moved] for x in (robot.assembly.speed, robot.assembly.effort)
+    )
+    qpos, qvel = np.tile(robot.start_qpos(), (9, 1)), np.zeros((9, 7))
+    qvel[:, 6:] = 1.2 * top
+    usual = trajectory_of(np.arange(9) * 0.005, qpos, qvel, qpos[:, 7:] + 1.0)
+    for motor, speed in ((1.0, 1.2), (1.5, 0.8)):
+        varied = replace(usual, variation=Variation(motor=motor))
+        checks = dict(passport.joint_checks(robot, varied, 0.0))
+        assert checks["speed"].value == pytest.approx(speed)
+        # From all of the effort at 3/4 of the top speed to what friction takes at it.
+        friction = robot.mj_model.dof_damping[6] * motor * top / effort
+        torque = 1 - (1 - friction) * (speed - 0.75) / 0.25
+        assert checks["torque"].value == pytest.approx(abs(torque), rel=1e-4)
 
 
 def trajectory_of(time, qpos, qvel, ctrl):

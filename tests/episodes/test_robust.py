@@ -85,5 +85,8 @@ def test_one_body_and_many_and_its_replay(settings):
     assert not np.allclose(fitness(genes, jax.random.key(8)), scores, rtol=1e-3)
     assert fitness.program(genes, KEY).cache_size() == 1
     one = make_fitness(settings, **{"task.trials": 1})
-    score, _ = one.judge(one.replay(genes[0], KEY), KEY)
+    swum = one.replay(genes[0], KEY)
+    score, _ = one.judge(swum, KEY)
+    assert swum.variation == one.variation(KEY) != Variation()
+    assert mixed.replay(robots[:1], genes[:1], KEY, 1)[0].variation == mixed.variation(KEY, 1)
     assert score == pytest.approx(float(one(genes[:1], KEY)[0]), rel=1e-3)

@@ -1,5 +1,7 @@
 """Forces on parts: closed forms, and the sum that the engines' step makes of them."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ import pytest
 from laboratory import accelerate, arm_robot, box_robot, face_drag, random_states, world
 from mjx_revolve.body.module_types import Thruster
 from mjx_revolve.engine.robot import Robot
+from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.view.forces import module_forces
 from mjx_revolve.water.flow import Water, flow, water_of
@@ -62,6 +65,15 @@ def test_drag_of_a_brick(axis):
     expected = np.zeros((2, 3))
     expected[:, axis] = 0.5 * RHO * 1.05 * area * np.array([-(0.3**2), 0.4**2])
     assert drag == pytest.approx(expected, rel=1e-4, abs=1e-6)
+
+
+def test_forces_are_those_of_the_coefficients_of_the_episode():
+    robot = box_robot(BRICK, 0.03, world(gravity=G, buoyancy="partial", drag="faces"))
+    usual = states(robot, [pose()], np.array([[0.3, -0.2, 0.1, 1.0, 0.5, -0.7]]))
+    varied = replace(usual, variation=Variation(drag=1.2, density=1.1))
+    own, other = (module_forces(robot, x) for x in (usual, varied))
+    assert other.drag == pytest.approx(1.2 * 1.1 * own.drag, rel=1e-5)
+    assert other.buoyancy == pytest.approx(1.1 * own.buoyancy, rel=1e-5)
 
 
 def test_lift_of_a_plate():

@@ -72,7 +72,7 @@ def replay_champion(record: RunRecord, fitness: Fitness) -> ChampionReplay:
         fitness.robot, trajectory, begin, fitness.water(key),
         target_at_last(fitness.config.task, trajectory), fitness.config.task,
     )  # fmt: skip
-    finite = jax.tree.map(lambda x: x[:count], trajectory)
+    finite = jax.tree.map(lambda x: x[:count] if np.ndim(x) else x, trajectory)
     return ChampionReplay(motion, score, measures, trace_sensors(fitness, finite, key))
 
 
