@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("quick_compiles")]
 
 def swing(morphology, depth, seconds=3.0, variation=None, phase=2.0, **fields):
     """A robot whose motors follow sines, and what it did."""
-    robot = build_robot(morphology, load_world("lake", **fields))
+    robot = build_robot(morphology, load_world("lake", **{"bed": None} | fields))
     count, dt = robot.mj_model.nu, robot.world.timestep
     time = dt * np.arange(round(seconds / dt))[:, None]
     ctrl = 0.7 * np.sin(2 * np.pi * time + phase * np.arange(count))
