@@ -108,8 +108,8 @@ def contact_acceleration(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Accelerations of robots by contacts of their own modules.
 
-    Only robots are looked at that have used up their clearance, a few at a time. Where XLA has no
-    CPU, a kernel takes as long for one robot as for all: there all are looked at when one has.
+    Only robots are looked at that have used up their clearance, a few at a time. On other back ends
+    than the CPU a kernel takes as long for one robot as for all: there all are, when one has.
 
     Args:
         meetings: which boxes can meet.
