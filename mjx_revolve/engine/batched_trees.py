@@ -99,9 +99,9 @@ class BatchedTrees:
     met: Meetings | None = None
     variation: Variation | None = None
 
-    def with_variation(self, variation: Variation) -> BatchedTrees:
-        """The same robots with other coefficients."""
-        return replace(self, variation=variation)
+    def with_variation(self, variation: Variation | None) -> BatchedTrees:
+        """The same robots with other coefficients; None: with their own."""
+        return self if variation is None else replace(self, variation=variation)
 
     def _own(self, level: Level) -> Level:
         """A level's constants with the variation."""

@@ -127,7 +127,7 @@ def _powers(
     water: Water, variation: Variation | None,
 ) -> dict[str, jax.Array]:  # fmt: skip
     """Of each step, `[T - 1]`, as lanes: kinetic energy before and after [J], and powers [W]."""
-    tree = tree if variation is None else tree.with_variation(variation)
+    tree = tree.with_variation(variation)
     lanes, dt = ctrl.shape[1:], tree.world.timestep
     before, after = (init(tree, qpos[:, rows], qvel[:, rows]) for rows in (_BEGUN, _ENDED))
     turn = quat_to_mat(before.quat)

@@ -70,8 +70,7 @@ def motor_torques(
     Returns:
         `[S, nhinge]` in the order of the hinges [N·m].
     """
-    tree = make_single_tree(robot, contact=False)
-    tree = tree if variation is None else tree.with_variation(variation)
+    tree = make_single_tree(robot, contact=False).with_variation(variation)
     hinges = (np.asarray(qpos)[:, 7:], np.asarray(qvel)[:, 6:], np.asarray(ctrl)[:, robot.servos])
     angle, speed, targets = (tree.joints_to_tree(jnp.asarray(x.T)) for x in hinges)
     still = (jnp.zeros(len(hinges[0])),) * 3

@@ -63,7 +63,7 @@ class PopulationEngine:
     @property
     def _tree(self) -> Tree:
         # Varied where they are used: a loop then holds a few factors, not all constants by lanes.
-        return self.tree if self.variation is None else self.tree.with_variation(self.variation)
+        return self.tree.with_variation(self.variation)
 
     def with_variation(self, variation: Variation) -> PopulationEngine:
         """The same engine with other coefficients."""

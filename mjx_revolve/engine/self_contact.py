@@ -171,8 +171,9 @@ def _settle(
     and join those that push.
     """
     size, steps = len(which), robots.steps
-    bodies, find = 1 + len(steps), _find_contacts if on_cpu() else _find_at_once
+    bodies = 1 + len(steps)
     halves = felt > bodies
+    find = _find_contacts if on_cpu() else _find_at_once
     zeros = lambda *shape: jnp.zeros((*shape, size), steps.dtype)  # noqa: E731
     none = _Contacts(
         zeros(_MOST),
@@ -263,7 +264,7 @@ def append_true(flags: jax.Array, values: jax.Array, found: Any, steady: bool) -
 
     `steady` loops have a known length, so that they have derivatives.
     """
-    if not on_cpu():
+    if not on_cpu():  # where a loop over flags would be a kernel for each
         listed, count = found
         ends = count + jnp.cumsum(flags, dtype=jnp.int32)
         places = jnp.where(flags, ends - 1, len(listed))

@@ -90,8 +90,10 @@ class SingleTree:
         """Whether any body may touch the bed."""
         return any(level.points is not None for level in self.all)
 
-    def with_variation(self, variation: Variation) -> SingleTree:
-        """The same robot with other coefficients."""
+    def with_variation(self, variation: Variation | None) -> SingleTree:
+        """The same robot with other coefficients; None: with its own."""
+        if variation is None:
+            return self
         below = tuple(vary_level(level, variation) for level in self.below)
         return replace(self, root=vary_level(self.root, variation), below=below)
 

@@ -49,8 +49,8 @@ class Tree(Protocol):
     def touches(self) -> bool:
         """Whether any body can touch the bed."""
 
-    def with_variation(self, variation: Variation) -> Self:
-        """The same robots with other coefficients, which may be traced."""
+    def with_variation(self, variation: Variation | None) -> Self:
+        """The same robots with other coefficients, which may be traced; None: with their own."""
 
     def joints_to_tree(self, values: Float[Array, "nhinge lanes"]) -> Any:
         """Joint values from values in each robot's own order."""

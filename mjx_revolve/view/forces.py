@@ -81,9 +81,7 @@ def module_forces(
         command = np.asarray(trajectory.command)[rows]
     time = np.asarray(trajectory.time, float)[rows]
     now = water_at(robot.world, rows, time, count, water)
-    levels = make_single_tree(robot)
-    if trajectory.variation is not None:
-        levels = levels.with_variation(trajectory.variation)
+    levels = make_single_tree(robot).with_variation(trajectory.variation)
 
     def run(qpos: jax.Array, qvel: jax.Array, command: jax.Array, water: Water) -> Any:
         # The rows of the trajectory are the lanes, like a population.

@@ -85,7 +85,7 @@ def trace_sensors(
     found = _compiled(fitness, steps)(
         jax.tree.map(lambda x: jnp.asarray(x, start.dtype), rows),
         jax.tree.map(lambda x: jnp.asarray(x)[..., None], fitness.context(key, trial)),
-        fitness.variation(key, trial),
+        trajectory.variation,
     )
     given, true = jax.tree.map(np.asarray, found)
     if fitness.controller.rate is not None:  # the brain has what there was at its last command
