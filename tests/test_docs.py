@@ -21,7 +21,7 @@ import pytest
 
 import mjx_revolve
 from browser import Browser, needs_browser
-from laboratory import ROOT, need_mjx
+from laboratory import ROOT, XLA_FLAGS, need_mjx
 from mjx_revolve.inputs.packages import REQUIREMENTS
 
 FOUND = [m.name for m in pkgutil.walk_packages(mjx_revolve.__path__, "mjx_revolve.")]
@@ -146,7 +146,7 @@ def test_the_tables_of_measures_are_the_codes():
 @pytest.mark.slow
 def test_the_page_of_settings_is_what_the_code_reads():
     """Every task, controller and setting, with what it takes; `make docs` writes it anew."""
-    place = {"PYTHONPATH": str(ROOT)}
+    place = XLA_FLAGS | {"PYTHONPATH": str(ROOT)}
     code = "import runpy; print(runpy.run_path('docs/settings.py')['make_page'](), end='')"
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, env=os.environ | place
@@ -317,7 +317,7 @@ def test_things_are_not_persons():
 def run_script(name, *arguments):
     """What a script of `docs/` prints."""
     command = [sys.executable, str(ROOT / "docs" / name), *map(str, arguments)]
-    place = {"PYTHONPATH": str(ROOT)}
+    place = XLA_FLAGS | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | place)
     assert done.returncode == 0, done.stderr
     return done

@@ -1,6 +1,7 @@
 """The command line with the real robot: what a new user types, and what comes out."""
 
 import csv
+import os
 import shutil
 import subprocess
 import sys
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from laboratory import ROOT
+from laboratory import ROOT, XLA_FLAGS
 from mjx_revolve.evolution.run_folder import RunFolder
 from toys import CLOCK
 
@@ -19,6 +20,7 @@ def command(name, *arguments, check=True):
     run = subprocess.run(
         [sys.executable, "-m", f"mjx_revolve.{name}", *map(str, arguments)],
         cwd=ROOT,
+        env=os.environ | XLA_FLAGS,
         capture_output=True,
         text=True,
         timeout=1800,  # a guard against hanging, on a busy machine too

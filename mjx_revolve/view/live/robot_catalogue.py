@@ -130,10 +130,9 @@ def load_catalogue(paths: Sequence[str], world: str | None = None) -> RobotCatal
         if alike and _can_swim(more[0].body, water):
             drafts += [x for x in more if (x.short, x.name) not in known]
     title = " and ".join(Path(path).stem or path for path in paths)
-    # Drafts are trimmed, as far as they can be.
-    mixed = make_mixed_fitness(
-        override_config(config, {"trim": "none"}), [draft.body for draft in drafts]
-    )
+    # Drafts are trimmed, as far as they can be; many share a body.
+    bodies = {id(draft.body): draft.body for draft in drafts}
+    mixed = make_mixed_fitness(override_config(config, {"trim": "none"}), [*bodies.values()])
     return RobotCatalogue(mixed, tuple(_entry(mixed, draft) for draft in drafts), title)
 
 
