@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_revolve.body.morphology import Morphology, load_morphology, trim_neutral
-from mjx_revolve.engine.robot import build_robot, check_timestep
+from mjx_revolve.engine.robot import Robot, build_robot, check_timestep
 from mjx_revolve.engine.spheres import count_spheres
 from mjx_revolve.episodes.config import Config, load_config, override_config
 from mjx_revolve.episodes.fitness import MixedFitness, make_mixed_fitness
@@ -133,7 +133,9 @@ def load_catalogue(paths: Sequence[str], world: str | None = None) -> RobotCatal
     # Drafts are trimmed, as far as they can be; many share a body.
     bodies = {id(draft.body): draft.body for draft in drafts}
     mixed = make_mixed_fitness(override_config(config, {"trim": "none"}), [*bodies.values()])
-    return RobotCatalogue(mixed, tuple(_entry(mixed, draft) for draft in drafts), title)
+    robots = {key: build_robot(body, mixed.world) for key, body in bodies.items()}
+    entries = tuple(_entry(mixed, draft, robots[id(draft.body)]) for draft in drafts)
+    return RobotCatalogue(mixed, entries, title)
 
 
 def _can_swim(morphology: Morphology, water: World) -> bool:
@@ -145,9 +147,8 @@ def _can_swim(morphology: Morphology, water: World) -> bool:
     return True
 
 
-def _entry(mixed: MixedFitness, draft: _Draft) -> CatalogueEntry:
-    """A draft with its robot built."""
-    robot = build_robot(draft.body, mixed.world)
+def _entry(mixed: MixedFitness, draft: _Draft, robot: Robot) -> CatalogueEntry:
+    """A draft with its robot."""
 
     def genes() -> np.ndarray | None:
         count = mixed.controller_of(robot).num_genes
