@@ -146,7 +146,7 @@ def test_the_tables_of_measures_are_the_codes():
 @pytest.mark.slow
 def test_the_page_of_settings_is_what_the_code_reads():
     """Every task, controller and setting, with what it takes; `make docs` writes it anew."""
-    place = XLA_FLAGS | {"PYTHONPATH": str(ROOT)}
+    place = {"PYTHONPATH": str(ROOT)}
     code = "import runpy; print(runpy.run_path('docs/settings.py')['make_page'](), end='')"
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, env=os.environ | place
