@@ -68,9 +68,10 @@ STEP = 0.1
 """Largest change of the score at half and a quarter of the step, as a share of it or of what the
 brain adds to it, whichever is more: half of what two measurements of one real robot differ by."""
 WORST_TENTH = 0.5
-"""Least share of the score of the worst tenth of fresh starts: no lucky starts."""
+"""Least share of the score, or of what the brain adds to it where it is no rate, of the worst tenth
+of fresh starts: no lucky starts."""
 VARIED = 0.5
-"""Least share of the score with a coefficient 30 % off: what goes with its square is left half."""
+"""Least such share with a coefficient 30 % off: what goes with its square is left half."""
 BRAINLESS = 0.1
 """Largest share of the score that a robot with joints at rest has: what only floats or sinks."""
 OVERLAP = 3.0
@@ -235,35 +236,42 @@ def _swim(fitness: Fitness, genes: jax.Array, key: jax.Array) -> Iterator[tuple[
         scores = coarse.result()
         finer = {part: found.result()[usual].mean() for part, found in fine.items()}
     own = scores[usual][:_STARTS]
-    # Scores that are no rates are no shares of each other: they are shown and have no limit.
+    first = own[:_FEW]
+    trials = scores[usual][_STARTS:].reshape(-1, _FEW)
+    rest = float(trials[-1].mean())
+    # A score that is no rate has no zero of its own: what counts is what the brain adds to rest.
     rates = unit.endswith("/s")
+    zero, whole = (0.0, "share") if rates else (rest, "share of what the brain adds")
 
-    def compare(words: str, found: np.ndarray, of: np.ndarray, least: float | None = None) -> Check:
-        if not rates:
-            return Check(f"score {words}", float(found.mean()), unit)
-        share = float(found.mean() / of.mean()) if of.mean() > 0 else math.nan
-        if least is None:  # of what should have no score at all; less is no gain
-            return Check(f"share {words}", max(share, 0.0), most=BRAINLESS)
-        return Check(f"share {words}", share, least=least)
+    def share(words: str, found: np.ndarray, of: np.ndarray, least: float) -> Check:
+        added = float(of.mean()) - zero
+        kept = (float(found.mean()) - zero) / added if added > 0 else math.nan
+        return Check(f"{whole} {words}", kept, least=least)
 
     yield "score", Check(f"score from {_STARTS} fresh starts", float(own.mean()), unit)
     yield "score_sd", Check("its standard deviation", float(own.std()), unit)
     worst = np.sort(own)[: _STARTS // 10]
-    yield "worst_tenth", compare("in the worst tenth", worst, own, WORST_TENTH)
+    yield "worst_tenth", share("in the worst tenth", worst, own, WORST_TENTH)
     for seconds, found in scores.items():
-        if seconds != usual:
-            kept = found[:_STARTS]
-            yield f"kept_{seconds:g}_s", compare(f"kept over {seconds:g} s", kept, own, KEPT)
-    first = own[:_FEW]
-    trials = scores[usual][_STARTS:].reshape(-1, _FEW)
+        if seconds == usual:
+            continue
+        name, kept = f"kept_{seconds:g}_s", found[:_STARTS]
+        if rates:
+            yield name, share(f"kept over {seconds:g} s", kept, own, KEPT)
+        else:  # it may grow or shrink with time: it is shown and has no limit
+            yield name, Check(f"score over {seconds:g} s", float(kept.mean()), unit)
     # A score that is best at zero, as a distance to keep, is compared with what the brain adds.
-    scale = max(abs(first.mean()), abs(first.mean() - trials[-1].mean()), 1e-9)
+    scale = max(abs(first.mean()), abs(first.mean() - rest), 1e-9)
     for part, mean in finer.items():
         change = float(abs(mean - first.mean()) / scale)
         yield f"step_over_{part}", Check(f"change at 1/{part} of the step", change, most=STEP)
     for (name, (words, _)), found in zip(tried.items(), trials, strict=False):
-        yield name, compare(f"with {words}", found, first, VARIED)
-    yield "brainless", compare("with joints at rest", trials[-1], first)
+        yield name, share(f"with {words}", found, first, VARIED)
+    if rates:  # should have no score at all; less is no gain
+        still = max(rest / float(first.mean()), 0.0) if first.mean() > 0 else math.nan
+        yield "brainless", Check("share with joints at rest", still, most=BRAINLESS)
+    else:
+        yield "brainless", Check("score with joints at rest", rest, unit)
 
 
 def _variants() -> dict[str, tuple[str, Variation]]:

@@ -60,6 +60,33 @@ def test_what_only_drifts_fails_without_its_brain_alone(tmp_path, short):
     np.testing.assert_allclose(*(scores[1.2] for scores in both), rtol=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("rest", "worst"),
+    [
+        (-1.5, 0.3 / 1.37),  # most of what the brain adds is lost in the worst tenth
+        (-9.0, 7.8 / 8.87),
+        (-0.02, np.nan),  # it adds nothing, of which there are no shares
+    ],
+)
+def test_scores_that_are_no_rates_are_judged_by_what_the_brain_adds(
+    tmp_path, monkeypatch, rest, worst
+):
+    """As minus the root mean square error of a depth: none of them is above zero."""
+    fitness = make_fitness(swimmer(tmp_path, OAR, TASK | {"type": "hold_depth"}))
+    own = np.full(64, -0.02)
+    own[20:26] = -1.2
+    lanes = np.concatenate([own, np.full(48, -0.02), np.full(8, rest)])
+    scores = {0.6: lanes, 30.0: 9 * own, 120.0: 9 * own}
+    monkeypatch.setattr(passport, "_scores", lambda *given: scores)
+    found = Passport(dict(passport._swim(fitness, np.zeros(1), jax.random.key(0))))
+    assert found.checks["worst_tenth"].value == pytest.approx(worst, rel=2e-3, nan_ok=True)
+    assert ("worst_tenth" in found.failed) == (not worst > 0.5)
+    assert ("drag_less" in found.failed) == np.isnan(worst)
+    for name, value in (("kept_120_s", 9 * own.mean()), ("brainless", rest)):
+        assert found.checks[name].value == pytest.approx(value)
+        assert not found.checks[name].judged
+
+
 def test_courses_and_gusts_are_the_same_for_all_times_and_steps():
     task = TASK | {"type": "follow_course", "course_spread": 1.0, "course_changes": 2}
     own = {"name": "lake", "gust": {"std": 0.1, "time": 1.0}}
