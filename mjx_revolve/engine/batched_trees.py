@@ -31,7 +31,7 @@ import numpy as np
 from mjx_revolve.engine.batch import Capacity, PackedBodies
 from mjx_revolve.engine.level import Level, Thrusters
 from mjx_revolve.engine.meetings import Boxes, Meetings
-from mjx_revolve.engine.variation import Variation, vary_level
+from mjx_revolve.engine.variation import Variation, vary_level, vary_thrusters
 from mjx_revolve.numerics.spatial import Scalar, Vec
 from mjx_revolve.numerics.xla import fuse, materialize, take_lanes
 from mjx_revolve.water.world import World
@@ -115,7 +115,8 @@ class BatchedTrees:
     @property
     def thrusters(self) -> Thrusters:
         """Of the robots, `[nthruster, lanes]`."""
-        return self.bodies.thrusters
+        own = self.bodies.thrusters
+        return own if self.variation is None else vary_thrusters(own, self.variation)
 
     @property
     def carries(self) -> bool:

@@ -23,7 +23,7 @@ from mjx_revolve.engine.meetings import Boxes, Meetings
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.step_constants import StepConstants, read_constants, select_bodies
 from mjx_revolve.engine.thrusters import read_thrusters
-from mjx_revolve.engine.variation import Variation, vary_level
+from mjx_revolve.engine.variation import Variation, vary_level, vary_thrusters
 from mjx_revolve.numerics.spatial import Vec, add, fold, namespace, total
 from mjx_revolve.numerics.xla import take_lanes
 from mjx_revolve.water.world import World
@@ -95,7 +95,10 @@ class SingleTree:
         if variation is None:
             return self
         below = tuple(vary_level(level, variation) for level in self.below)
-        return replace(self, root=vary_level(self.root, variation), below=below)
+        thrusters = vary_thrusters(self.thrusters, variation)
+        return replace(
+            self, root=vary_level(self.root, variation), below=below, thrusters=thrusters
+        )
 
     # Joint values, level by level and in the robot's order.
 

@@ -1,8 +1,8 @@
 """Uncertain coefficients of water and motors, as factors on the constants of a step.
 
-A law's coefficients are known to some tens of per cent, a motor's speed to ten. The factors are
-traced, so that one compiled program serves all their values; without factors the constants are
-Python numbers and fold away.
+A law's coefficients are known to some tens of per cent, a motor's speed and thrust to ten. The
+factors are traced, so that one compiled program serves all their values; without factors the
+constants are Python numbers and fold away.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.engine.level import Hinges, Level
+from mjx_revolve.engine.level import Hinges, Level, Thrusters
 from mjx_revolve.engine.step_constants import TORQUE_CURVE_KNEE
 from mjx_revolve.numerics.spatial import Scalar
 from mjx_revolve.water.laws import scale_numbers
@@ -28,7 +28,7 @@ class Variation(NamedTuple):
         added_mass: on all water that parts carry along.
         density: of the water: on buoyancy, on these drags and on what is carried. Weights stay, so
             a robot that hovered no longer does. Thrusters keep their curves, which are measured.
-        motor: on the servos' top speed; they keep their effort.
+        motor: on the servos' top speed, as they keep their effort, and on the thrusters' thrust.
     """
 
     drag: Scalar = 1.0
@@ -56,6 +56,20 @@ def vary_level(level: Level, variation: Variation) -> Level:
         hinges=None if level.hinges is None else _vary_hinges(level.hinges, row.motor),
         parts=tuple(scale_numbers(parts, row._asdict()) for parts in level.parts),
     )
+
+
+def vary_thrusters(thrusters: Thrusters, variation: Variation) -> Thrusters:
+    """The thrusters of robots, with other thrusts at the same commands."""
+    if not thrusters.count:
+        return thrusters
+    motor = jnp.atleast_1d(jnp.asarray(variation.motor))[None]
+    scale = lambda x: _as(x, motor) * motor  # noqa: E731
+    line = thrusters.line
+    if line is not None:
+        commands, thrusts, is_line = line
+        line = commands, tuple(map(scale, thrusts)), is_line
+    backward, forward = map(scale, (thrusters.backward, thrusters.forward))
+    return replace(thrusters, backward=backward, forward=forward, line=line)
 
 
 def _vary_hinges(hinges: Hinges, motor: jax.Array) -> Hinges:

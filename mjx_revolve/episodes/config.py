@@ -201,7 +201,8 @@ class RobustConfig(Settings):
     """Of the water: fresh water differs by so much between 0 and 30 °C. Robots keep the trim that
     they have [-]."""
     motor: Annotated[Number, Ge(1), Le(10), Unit("-")] = 1.1
-    """On the servos' top speed: about what a hobby servo's differs by between 4.8 and 6 V [-]."""
+    """On the servos' top speed, which differs by about so much between 4.8 and 6 V, and on the
+    thrusters' thrust [-]."""
 
 
 @also(OFF, {"const": True})

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from laboratory import QUICK, WATER, body, box_robot, oar_robot, random_states, with_motors, world
+from mjx_revolve.body.module_types import Thruster
 from mjx_revolve.engine.population import acceleration, tree_plant
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.single_tree import make_single_tree
+from mjx_revolve.engine.thrusters import run_thrusters
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.water.flow import water_of
 
@@ -77,3 +79,19 @@ def test_motors_without_a_limit_have_none_after_it():
     varied = levels.with_variation(Variation(motor=0.5))
     for before, after in zip(levels.below, varied.below, strict=True):
         assert after.hinges.motor == before.hinges.motor
+
+
+@pytest.mark.parametrize("curve", ["dead_band", "interpolated"])
+def test_thrusters_push_by_the_factor_more_at_any_command(curve):
+    shape = {"commands": (-1.0, 0.2, 1.0), "thrusts": (-2.0, 0.0, 3.0)}
+    thruster = Thruster(curve=curve, time_constant=0.0, **shape if curve == "interpolated" else {})
+    robot = box_robot(BOX, tank=world(**WATER), thruster=thruster, **CUBE)
+    levels, ctrl = make_single_tree(robot), np.array([[-0.9, -0.3, 0.4, 1.0]])
+    factors = np.array([0.7, 1.3, 1.3, 0.7])
+    own, varied = (
+        run_thrusters(tree.thrusters, ctrl, jnp.asarray(ctrl), 1000.0)[1:]
+        for tree in (levels, levels.with_variation(Variation(motor=factors)))
+    )
+    assert np.all(np.abs(own[0]) > 0)
+    np.testing.assert_allclose(varied[0], own[0] * factors, rtol=1e-6)
+    np.testing.assert_allclose(varied[1], own[1] * factors**1.5, rtol=1e-5)
