@@ -84,7 +84,7 @@ class PopulationEngine:
     ) -> tuple[State, jax.Array]:
         tree = self._tree
         dt = tree.world.timestep
-        targets, command, thrusts, pumped = actuate(self.tree, state, ctrl)
+        targets, command, thrusts, pumped = actuate(tree, state, ctrl)
         # The whole step is seen from the uniform current: there, no current is left.
         relative = state._replace(velocity=vsub(state.velocity, water.current))
         qacc, power, submerged, clearance, pressed = accelerate(
@@ -165,7 +165,8 @@ class PopulationEngine:
         self, state: State, ctrl: Float[Array, "n lanes"], water: Water
     ) -> tuple[Vec, Vec]:
         """Force of the bed and of the water on whole robots; see `forces.external_force`."""
-        return forces.external_force(self._tree, state, water, actuate(self.tree, state, ctrl)[2])
+        tree = self._tree
+        return forces.external_force(tree, state, water, actuate(tree, state, ctrl)[2])
 
 
 def actuate(tree: Tree, state: State, ctrl: jax.Array) -> tuple[Any, Any, Any, Scalar]:

@@ -10,8 +10,8 @@ from mjx_revolve.body.module_types import Thruster
 from mjx_revolve.engine.population import acceleration, tree_plant
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.single_tree import make_single_tree
-from mjx_revolve.engine.thrusters import run_thrusters
 from mjx_revolve.engine.variation import Variation
+from mjx_revolve.episodes.simulate import simulate
 from mjx_revolve.water.flow import water_of
 
 BOX = (0.2, 0.1, 0.06)
@@ -81,17 +81,32 @@ def test_motors_without_a_limit_have_none_after_it():
         assert after.hinges.motor == before.hinges.motor
 
 
-@pytest.mark.parametrize("curve", ["dead_band", "interpolated"])
-def test_thrusters_push_by_the_factor_more_at_any_command(curve):
-    shape = {"commands": (-1.0, 0.2, 1.0), "thrusts": (-2.0, 0.0, 3.0)}
-    thruster = Thruster(curve=curve, time_constant=0.0, **shape if curve == "interpolated" else {})
-    robot = box_robot(BOX, tank=world(**WATER), thruster=thruster, **CUBE)
-    levels, ctrl = make_single_tree(robot), np.array([[-0.9, -0.3, 0.4, 1.0]])
-    factors = np.array([0.7, 1.3, 1.3, 0.7])
-    own, varied = (
-        run_thrusters(tree.thrusters, ctrl, jnp.asarray(ctrl), 1000.0)[1:]
-        for tree in (levels, levels.with_variation(Variation(motor=factors)))
-    )
-    assert np.all(np.abs(own[0]) > 0)
-    np.testing.assert_allclose(varied[0], own[0] * factors, rtol=1e-6)
-    np.testing.assert_allclose(varied[1], own[1] * factors**1.5, rtol=1e-5)
+@pytest.mark.parametrize(
+    "pushes",
+    [
+        lambda m: {
+            "curve": "dead_band",
+            "gain": 2.0 * m,
+            "gain_backward": 1.5 * m,
+            "dead_band": (-0.1, 0.1),
+        },
+        lambda m: {
+            "curve": "interpolated",
+            "commands": (-1.0, 0.2, 1.0),
+            "thrusts": (-2.0 * m, 0.0, 3.0 * m),
+        },
+    ],
+    ids=["dead_band", "interpolated"],
+)
+def test_a_stronger_thruster_is_one_with_another_curve(pushes):
+    """Ahead and astern, its power too: the same episodes."""
+    swum = []
+    for own, factor in ((1.0, 1.3), (1.3, 1.0)):
+        thruster = Thruster(time_constant=0.1, **pushes(own))
+        robot = box_robot(BOX, tank=world(**WATER), thruster=thruster, **CUBE)
+        varied = Variation(motor=factor)
+        swum += [simulate(robot, [x], 0.1, variation=varied) for x in (0.9, -0.8)]
+    for one, other in zip(swum[:2], swum[2:], strict=True):
+        np.testing.assert_allclose(one.qvel, other.qvel, rtol=1e-4, atol=1e-7)
+        np.testing.assert_allclose(one.power, other.power, rtol=1e-4)
+        assert one.power[-1] > 0.01
