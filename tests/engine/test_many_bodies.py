@@ -319,7 +319,7 @@ NOISY = {
     ("kind", "other", "tank", "task", "checked"),
     [
         ("feedback", "auv", {"name": "lake", "gust": {"std": 0.05, "time": 2.0}},
-         {"task.trials": 2}, 1),
+         {"task.trials": 2, "task.robust": {"motor": 2.0}}, 1),
         ("cpg", "fish", {"name": "lake", "waves": [{"amplitude": 0.02, "wavelength": 1.0}]}, {}, 1),
         ("own", "snake", {"name": "lake", "bed": {"kind": "flat", "height": -3.0}}, CRAWL, 0),
         ("rnn", "auv", {"name": "lake"}, NOISY, 1),
@@ -327,7 +327,7 @@ NOISY = {
     ],
 )  # fmt: skip
 def test_every_controller_drives_every_body(config, tmp_path, kind, other, tank, task, checked):
-    """With thrusters and fins, crawling, in gusts and waves: as if each were alone."""
+    """With thrusters of other thrust and fins, crawling, in gusts and waves: as if alone."""
     (tmp_path / "own.py").write_text(OWN)
     settings = {
         "controller.type": f"{tmp_path / 'own.py'}:make_wave" if kind == "own" else kind,
