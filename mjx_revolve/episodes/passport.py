@@ -243,21 +243,21 @@ def _swim(fitness: Fitness, genes: jax.Array, key: jax.Array) -> Iterator[tuple[
     rates = unit.endswith("/s")
     zero, whole = (0.0, "share") if rates else (rest, "share of what the brain adds")
 
-    def share(words: str, found: np.ndarray, of: np.ndarray, least: float) -> Check:
+    def share(found: np.ndarray, of: np.ndarray) -> float:
         added = float(of.mean()) - zero
-        kept = (float(found.mean()) - zero) / added if added > 0 else math.nan
-        return Check(f"{whole} {words}", kept, least=least)
+        return (float(found.mean()) - zero) / added if added > 0 else math.nan
 
     yield "score", Check(f"score from {_STARTS} fresh starts", float(own.mean()), unit)
     yield "score_sd", Check("its standard deviation", float(own.std()), unit)
     worst = np.sort(own)[: _STARTS // 10]
-    yield "worst_tenth", share("in the worst tenth", worst, own, WORST_TENTH)
+    words = f"{whole} in the worst tenth"
+    yield "worst_tenth", Check(words, share(worst, own), least=WORST_TENTH)
     for seconds, found in scores.items():
         if seconds == usual:
             continue
         name, kept = f"kept_{seconds:g}_s", found[:_STARTS]
         if rates:
-            yield name, share(f"kept over {seconds:g} s", kept, own, KEPT)
+            yield name, Check(f"share kept over {seconds:g} s", share(kept, own), least=KEPT)
         else:  # it may grow or shrink with time: it is shown and has no limit
             yield name, Check(f"score over {seconds:g} s", float(kept.mean()), unit)
     # A score that is best at zero, as a distance to keep, is compared with what the brain adds.
@@ -266,9 +266,9 @@ def _swim(fitness: Fitness, genes: jax.Array, key: jax.Array) -> Iterator[tuple[
         change = float(abs(mean - first.mean()) / scale)
         yield f"step_over_{part}", Check(f"change at 1/{part} of the step", change, most=STEP)
     for (name, (words, _)), found in zip(tried.items(), trials, strict=False):
-        yield name, share(f"with {words}", found, first, VARIED)
+        yield name, Check(f"{whole} with {words}", share(found, first), least=VARIED)
     if rates:  # should have no score at all; less is no gain
-        still = max(rest / float(first.mean()), 0.0) if first.mean() > 0 else math.nan
+        still = max(share(trials[-1], first), 0.0)
         yield "brainless", Check("share with joints at rest", still, most=BRAINLESS)
     else:
         yield "brainless", Check("score with joints at rest", rest, unit)
