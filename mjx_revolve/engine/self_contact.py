@@ -189,9 +189,10 @@ def _settle(
         change = contacts.acceleration()[6:] - first * robots.hurry
         frames = robots.pose(steps + dt**2 * change)
         kept = weight(contacts.force > 0, clear)
-        table = find(meetings, which, moving > 0, frames, kept, dt, halves)
-        near = -first * robots.drift / dt**2
-        touches = _largest(weight((table.need > near) & (table.need < _KEPT), kept)) > 0
+        drift = first * robots.drift
+        table = find(meetings, which, moving > 0, frames, kept, drift, dt, halves)
+        near = (table.need > -drift / dt**2) & (table.need < _KEPT)
+        touches = _largest(weight(near, kept)) > 0
 
         def resolve() -> Any:
             found = contacts.join(table, frames[1], robots, change, dt, meetings.steady)
@@ -201,7 +202,7 @@ def _settle(
         found, moving = jax.lax.cond(
             any_lane(touches), resolve, lambda: (contacts, jnp.zeros_like(moving))
         )
-        clear = first * (table.clear - robots.drift) + (1 - first) * clear
+        clear = first * (table.clear - drift) + (1 - first) * clear
         return found, clear, moving, jnp.zeros_like(first)
 
     start = none, zeros(), weight(real, steps), jnp.ones_like(steps[0])
@@ -323,13 +324,14 @@ def _find_contacts(
     real: jax.Array,
     poses: tuple[BodyFrames, BodyFrames],
     kept: jax.Array,
+    drift: jax.Array,
     dt: float,
     halves: bool,
 ) -> ContactTable:
-    """Contacts of some robots: pairs with bounding spheres that overlap at the end of the step.
+    """Contacts of some robots: pairs with bounding spheres that may overlap when the step ends.
 
-    None take the places `[_MOST, lanes]` that are 1 in `kept`. `halves`: which halves of modules
-    are in contact is found, too.
+    None take the places `[_MOST, lanes]` that are 1 in `kept`; boxes are where they end but for a
+    `drift` of `[lanes]` [m]. `halves`: which halves of modules are in contact is found, too.
     """
     size, dtype, steady = len(which), kept.dtype, meetings.steady
     npair, lanes = meetings.first.shape
@@ -371,7 +373,7 @@ def _find_contacts(
         away, reach = end - start, radius + far
         given = take_lanes(real, one.lane) & (one.shell != other.shell) & (number < npair * size)
         square = dot(away, away)
-        near = given & (square < reach * reach)
+        near = given & (square < (reach + take_lanes(drift, one.lane)) ** 2)
         apart = jnp.where(given & ~near, jnp.sqrt(square) - reach, _FAR)
         for k in range(0, width, size):
             clear = jnp.minimum(clear, apart[k : k + size])
@@ -439,6 +441,7 @@ def _find_at_once(
     real: jax.Array,
     poses: tuple[BodyFrames, BodyFrames],
     kept: jax.Array,
+    _drift: jax.Array,
     dt: float,
     halves: bool,
 ) -> ContactTable:

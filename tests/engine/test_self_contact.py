@@ -27,6 +27,7 @@ from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.flow import water_of
 
 INWARDS = np.array([[0.785], [-0.785]])
+SWUNG = 498, 1717
 
 
 def water(**fields):
@@ -395,14 +396,19 @@ def test_pairs_that_can_never_meet_cost_nothing():
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("timestep", [0.005, 0.02])
 def test_random_bodies_under_fast_random_gaits_hardly_overlap(timestep):
+    """Also two of ten thousand whose servos swung parts into each other that, at the speeds at
+    which the step began, would have stayed apart."""
     world = water(timestep=timestep)
-    robots = [build_robot(random_body(k, 4 + k % 9, 6), world) for k in range(100, 164)]
+    robots = [build_robot(random_body(k, 4 + k % 9, 6), world) for k in (*range(100, 164), *SWUNG)]
     robots = [r for r in robots if len(r.assembly.meeting_pairs)]
     assert len(robots) > 20
     capacity, steps = fit_capacity(robots), round(2.0 / timestep)
     ctrl = np.zeros((steps, capacity.hinges, 4 * len(robots)))
     for k, robot in enumerate(robots):
         ctrl[:, : robot.num_hinges, 4 * k : 4 * k + 4] = random_gaits(robot, 4, steps, k)
+    for k, number in enumerate(SWUNG, len(robots) - len(SWUNG)):
+        gait = random_gaits(robots[k], 1, steps, number)
+        ctrl[:, : robots[k].num_hinges, 4 * k : 4 * k + 4] = gait
     found = march_batch(robots, capacity, 4, ctrl, steps)
     assert np.isfinite(found).all()
     deep = np.concatenate(
