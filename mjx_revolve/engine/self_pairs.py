@@ -131,7 +131,7 @@ def meeting_pairs(assembly: Assembly) -> Int[np.ndarray, "pairs 2"]:
     way = (above[own[:, 0]] ^ above[own[:, 1]]).T
     kept, spent, budget = np.zeros(len(pairs), bool), np.zeros(len(pairs), int), _BUDGET
     which = np.arange(len(pairs))
-    # In single precision, which is a thousandth of the clearance and twice as fast.
+    # In single precision: errs by less than a thousandth of the clearance, and is faster.
     single = lambda x: np.asarray(x, np.float32)  # noqa: E731
     center, edge = (single(np.where(way, x[:, None], 0)) for x in (middle, half))
     axis, place, size = (single(x).T for x in (assembly.axis, table.position, table.half_size))
