@@ -45,7 +45,7 @@ CHANGES = {
 # Of the gradient; choices. Brains times episodes fill one chunk.
 BRAINS, EPISODES = 4, 16
 HORIZON, RATE, SPREAD = 2.0, 0.02, 0.2
-# Of the evolution, as the configuration has it.
+# Of the evolution; choices: half of the episodes of the configuration, twice the generations.
 POPULATION, TRIALS = 64, 8
 FRESH = 4  # keys of 16 starts each that nobody learnt from
 
