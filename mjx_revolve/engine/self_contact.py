@@ -37,6 +37,7 @@ from mjx_revolve.numerics.boxes import (
     box_contact,
     dot,
     last_of,
+    matmul,
     matvec,
     weight,
 )
@@ -521,10 +522,7 @@ def _placed(frames: jax.Array, shape: jax.Array) -> list[tuple[jax.Array, jax.Ar
     mat, found = lambda x: x.reshape(3, 3, x.shape[-1]), []
     for k in (0, 12):
         turn, position = mat(frames[k : k + 9]), frames[k + 9 : k + 12]
-        own = turn
-        if len(shape) > 6:
-            other = mat(shape[3:12])
-            own = sum(turn[:, k][:, None] * other[k][None] for k in range(3))
+        own = matmul(turn, mat(shape[3:12])) if len(shape) > 6 else turn
         found.append((own, position + matvec(turn, shape[:3])))
     return found
 

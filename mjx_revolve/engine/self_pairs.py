@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mjx_revolve.body.placement import pairs_within, turned
-from mjx_revolve.numerics.boxes import BoxPair, box_gap, dot, matvec, pair_of
+from mjx_revolve.numerics.boxes import BoxPair, box_gap, dot, matmul, matvec, pair_of
 
 if TYPE_CHECKING:
     from mjx_revolve.engine.assembly import Assembly
@@ -70,12 +70,6 @@ def _ancestry(parent: np.ndarray) -> np.ndarray:
     return found
 
 
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """A B of `[3, 3, n]`."""
-    found: np.ndarray = sum(a[:, k][:, None] * b[k][None] for k in range(3))
-    return found
-
-
 def _turning(axis: np.ndarray, x: np.ndarray) -> list[np.ndarray]:
     """`[n, 3, k]` columns x, K x and K² x, as `[3, k, n]`.
 
@@ -101,7 +95,7 @@ def _poses(assembly: Assembly, angle: np.ndarray) -> tuple[np.ndarray, np.ndarra
         above = assembly.parent[body]
         up = rotation[:, :, above]
         position[:, body] = position[:, above] + matvec(up, place[body])
-        rotation[:, :, body] = _product(up, own)
+        rotation[:, :, body] = matmul(up, own)
     return position, rotation
 
 
@@ -151,7 +145,7 @@ def meeting_pairs(assembly: Assembly) -> Int[np.ndarray, "pairs 2"]:
             body = table.body[part]
             turn = rotation[:, :, body, row]
             origin = position[:, body, row] + matvec(turn, place[:, part])
-            shapes.append((origin, _product(turn, axes[..., part]), size[:, part]))
+            shapes.append((origin, matmul(turn, axes[..., part]), size[:, part]))
             arm = origin[:, None] - position
             # The arm's length across the unit axis.
             across = np.maximum(dot(arm, arm) - dot(spin, arm) ** 2, 0)

@@ -85,6 +85,11 @@ def matvec(matrix: Scalar, x: Scalar) -> Scalar:
     return matrix[:, 0] * x[0] + matrix[:, 1] * x[1] + matrix[:, 2] * x[2]
 
 
+def matmul(a: Scalar, b: Scalar) -> Scalar:
+    """A B of `[3, 3, ...]` both."""
+    return matvec(a[:, :, None], b)
+
+
 def mat_t_vec(matrix: Scalar, x: Scalar) -> Scalar:
     """Mᵀ x."""
     return matrix[0] * x[0] + matrix[1] * x[1] + matrix[2] * x[2]
