@@ -24,6 +24,7 @@ from mjx_revolve.view.poses import finite_rows, pose_robot
 from mjx_revolve.view.recording import ReplayRobot
 from mjx_revolve.view.surroundings import (
     is_moving,
+    target_name,
     target_of,
     water_at,
     water_drift,
@@ -73,7 +74,8 @@ def episode_data(episode: Episode, forces: bool = True) -> Packed:
     low = float((parts[..., 2] - np.linalg.norm(robot.fluid.half_size, axis=1)).min())
     now = water_at(world, rows, time, len(trajectory.time), water)
     current = water_velocity(world, now, center)
-    target = target_of(episode.fitness.config.task if episode.fitness else None, trajectory)
+    task = episode.fitness.config.task if episode.fitness else None
+    target = target_of(task, trajectory)
     surface, begun = (_first(x) for x in (water.surface_height, water.time))
     net = qpos[-1, :2] - qpos[0, :2]
     data = replay_data(
@@ -99,6 +101,7 @@ def episode_data(episode: Episode, forces: bool = True) -> Packed:
             if is_moving(current)
             else None,
             "target": None if target is None else pack_floats(target[rows]),
+            "target_name": target_name(task),
             "anchors": _anchors(robot),
             "forces": _arrows(episode, every, water) if forces else _no_arrows(_LEFT_OUT),
             "deepest": max(

@@ -17,7 +17,7 @@ from mjx_revolve.engine.kinematics import mass_centers
 from mjx_revolve.episodes.tasks import body_length
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.short_repr import short_repr
-from mjx_revolve.view.surroundings import water_velocity
+from mjx_revolve.view.surroundings import target_name, water_velocity
 from mjx_revolve.water.flow import Water
 
 if TYPE_CHECKING:
@@ -69,6 +69,7 @@ class Motion:
         current: `[T, 3]` velocity of the water where the core is, waves apart, world frame [m/s].
         water_speed: net, through that water [m/s].
         target: `[3]` of the task, world frame [m], or None.
+        target_name: what it is called.
         cost: of transport, energy over weight times net distance [-].
         costs: `[T]` the same so far; NaN before it counts, and while the robot is closer than a
             tenth of its way to where it began.
@@ -100,6 +101,7 @@ class Motion:
     current: np.ndarray
     water_speed: float
     target: np.ndarray | None
+    target_name: str
     cost: float
     costs: np.ndarray
 
@@ -190,6 +192,7 @@ def analyse_motion(
         if seconds > 0.0
         else 0.0,
         target=target,
+        target_name=target_name(task),
         cost=float(costs[-1]),
         costs=np.where(far & (np.arange(count) > first), costs, np.nan),
     )

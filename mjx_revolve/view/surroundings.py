@@ -89,6 +89,11 @@ def target_of(task: TaskConfig | None, trajectory: Trajectory) -> np.ndarray | N
     return np.tile(np.asarray(task.target, float), (len(trajectory.time), 1))
 
 
+def target_name(task: TaskConfig | None) -> str:
+    """What pictures call a task's target: one that pursues the robot is a pursuer."""
+    return "target" if task is None or task.target_turn is None else "pursuer"
+
+
 def target_at_last(task: TaskConfig | None, trajectory: Trajectory) -> np.ndarray | None:
     """`[3]` the target at the end, world frame [m]; None without one."""
     found = target_of(task, trajectory)

@@ -13,6 +13,7 @@ import pytest
 
 from laboratory import WATER, body, world
 from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.plots import figure_png
@@ -168,12 +169,15 @@ def test_currents_are_drawn_and_speeds_told_apart(small):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("target", "words"),
-    [((0.4, 0.05, -1.0), "target"), ((5.3, 0.0, -1.0), "target, 5 m on"), (None, None)],
+    [((0.4, 0.05, -1.0), ""), ((5.3, 0.0, -1.0), ", 5 m on"), (None, None)],
 )
-def test_targets_are_drawn_or_pointed_at(small, target, words):
+@pytest.mark.parametrize("name", ["target", "pursuer"])
+def test_targets_are_drawn_or_pointed_at(small, name, target, words):
     place = None if target is None else np.array(target)
-    said = [w for w in words_of(small, swim(small), target=place) if "target" in w]
-    assert set(said) == (set() if words is None else {words})  # marked in both views
+    chase = {"target_distance": 1.5, "target_speed": 0.3, "target_turn": 0.5}
+    task = TaskConfig(type="escape", duration=10.0, **chase) if name == "pursuer" else None
+    said = [w for w in words_of(small, swim(small), target=place, task=task) if name in w]
+    assert set(said) == (set() if words is None else {name + words})  # marked in both views
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from mjx_revolve.view.film.camera import Shots, plan_circle, plan_shots
 from mjx_revolve.view.motion import smooth_path, speed_over, stroke_period
 from mjx_revolve.view.poses import finite_rows, pose_robot
 from mjx_revolve.view.recording import Mark, Recording, interpolate_poses
-from mjx_revolve.view.surroundings import bed_at, target_of, water_at, water_velocity
+from mjx_revolve.view.surroundings import bed_at, target_name, target_of, water_at, water_velocity
 from mjx_revolve.water.flow import Water, water_of
 from mjx_revolve.water.world import World
 
@@ -52,6 +52,7 @@ class EpisodeNotes:
         speed: `[F]` of the core, over a stroke or a second around each frame [m/s].
         current: `[F, 3]` velocity of the water around the robot, waves apart, world frame [m/s].
         target: `[F, 3]` world frame [m]; None without one.
+        target_name: what it is called.
     """
 
     score: str
@@ -61,6 +62,7 @@ class EpisodeNotes:
     speed: np.ndarray
     current: np.ndarray
     target: np.ndarray | None
+    target_name: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,13 +157,14 @@ def make_film(episode: Episode, size: tuple[int, int] = (640, 480), fps: int = 3
     if episode.score is not None:
         score = f"score {episode.score:.3g} {episode.score_unit}".rstrip()
         score += f", mean over {episode.starts}"
-    fitness = episode.fitness
-    target = target_of(None if fitness is None else fitness.config.task, episode.trajectory)
+    task = None if episode.fitness is None else episode.fitness.config.task
+    target = target_of(task, episode.trajectory)
     if target is not None:
         target = np.stack([np.interp(time, rows, x) for x in target[: len(rows)].T], axis=-1)
     notes = EpisodeNotes(
         score, episode.length, smooth_path(time, center, period), radius,
         speed_over(time, qpos[:, :3], period), water_velocity(world, water, center), target,
+        target_name(task),
     )  # fmt: skip
     shown = FilmRobot(robot, qpos, np.ones(len(time), bool))
     origin = (center.min(axis=0) + center.max(axis=0)) / 2

@@ -252,7 +252,7 @@ def _make_episode_words(film: Film, notes: EpisodeNotes) -> _Words:
         if flows:
             _sign_current(pen, film, notes.current[frame], frame)
         if notes.target is not None:
-            _sign_target(pen, film, notes.target[frame], frame)
+            _sign_target(pen, film, notes.target[frame], notes.target_name, frame)
         unit, edge, base, tick = pen.unit, pen.edge, pen.base, 4 * pen.unit
         pen.title(film.title)
         pen.write(edge, edge + pen.line, notes.score, "la")
@@ -286,13 +286,13 @@ def _sign_current(pen: Pen, film: Film, current: np.ndarray, frame: int) -> None
     pen.write(x, 24 * pen.unit, f"current {speed:.2f} m/s", "mm", FLOW)
 
 
-def _sign_target(pen: Pen, film: Film, target: np.ndarray, frame: int) -> None:
+def _sign_target(pen: Pen, film: Film, target: np.ndarray, name: str, frame: int) -> None:
     """The target: marked, or pointed at from the edge."""
     unit = pen.unit
     flat, away = film.shots.project(frame, target[None])
     middle = np.array([pen.width / 2, pen.height / 2])
     at = middle + pen.height / 2 * flat[0] * (1, -1)
-    words = f"target, {np.linalg.norm(target - film.center[frame]):.2g} m"
+    words = f"{name}, {np.linalg.norm(target - film.center[frame]):.2g} m"
     if away[0] > 0 and (at > 0).all() and (at < (pen.width, pen.height)).all():
         for reach in (5 * unit, 10 * unit):
             box, thick = [*(at - reach), *(at + reach)], max(2, round(2.5 * unit))

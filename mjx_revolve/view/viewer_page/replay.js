@@ -33,6 +33,7 @@ class EpisodeParts {
     Object.assign(this, { page, stage, size, begin, world, center, drift, target, place: new THREE.Vector3() });
     this.speed = track(episode.speed, 1);
     this.deepest = episode.deepest;
+    this.aim = episode.target_name;
     this.length = episode.length;
     this.speedName = episode.current ? "speed over ground" : "speed";
     page.heading = episode.heading;
@@ -96,7 +97,8 @@ class EpisodeParts {
     }
     if (this.target) {
       const far = place.distanceTo(this.target.vector(t, 0, this.place));
-      facts["to target"] = { text: `${far.toFixed(2)} m`, title: "from the core to the target, the pink diamond" };
+      const title = `from the core to the ${this.aim}, the pink diamond`;
+      facts[`to ${this.aim}`] = { text: `${far.toFixed(2)} m`, title };
     }
     page.tell(facts);
     stage.drawGauge(depth, this.deepest, world.surface - stage.bedAt(place.x, place.y));
