@@ -110,14 +110,14 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
         save_pictures,
         again,
     )
-    if code:
+    if code not in (0, 2):  # runs that failed by themselves leave the others to report on
         return code
     print("writing the report", flush=True)
     report = write_report(folder)
     for line in report.lost:
         print(f"warning: {line}", file=sys.stderr)
     print(f"report: {short_path(report.page)}; {short_path(report.table)}")
-    return 0
+    return code
 
 
 def _usual_folder(sweep: Sweep) -> Path:

@@ -8,6 +8,7 @@ import os
 import re
 import signal
 
+import numpy as np
 import pytest
 
 import toys
@@ -109,6 +110,20 @@ def test_wherever_a_sweep_is_dropped_it_ends_in_the_same_bits(folder, no_picture
     assert "finished before" in capsys.readouterr().out
     for name in RUNS:
         assert contents(folder / "out" / name) == contents(folder / "whole" / name)
+
+
+@pytest.mark.slow
+def test_a_run_of_which_every_episode_fails_does_not_stop_the_others(folder, no_pictures, capsys):
+    class Lost(toys.Toy):
+        def evaluate(self, population, key):
+            scores, measures = super().evaluate(population, key)
+            first = not (folder / "out" / "toy" / "seed_1").exists()
+            return np.full_like(scores, -np.inf) if first else scores, measures
+
+    assert run_sweep(*GRID[:3], *GRID[-2:], make_fitness=lambda config: Lost()) == 2
+    printed = capsys.readouterr()
+    assert "error: toy/seed_0: " in printed.err and "report: out/report.html" in printed.out
+    assert "finished" in RunFolder(folder / "out" / "toy" / "seed_1").info
 
 
 @pytest.mark.slow

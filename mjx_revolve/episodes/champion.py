@@ -179,7 +179,7 @@ def _champion(champion: ChampionRecord, duration: float | None, seed: int | None
     return _episode(
         config, fitness.robot.morphology.title, fitness.robot, fitness.replay(champion.genes, key),
         water=fitness.water(key), score=champion.score, genes=champion.genes, fitness=fitness,
-        **({} if champion.is_final else _selected(config)),
+        **({} if champion.is_final else _selected(champion.load_run_config())),
     )  # fmt: skip
 
 

@@ -311,12 +311,8 @@ class ChampionRecord:
             )
         return found
 
-    def load_config(self, **overrides: object) -> Config:
-        """The run's configuration; where bodies have evolved, of the champion's body alone.
-
-        Raises:
-            InputError: there is no such file, or no body.
-        """
+    def load_run_config(self, **overrides: object) -> Config:
+        """The run's configuration; raises `InputError` if there is no such file."""
         named = self.facts.get("config", "../config.yaml")
         if not isinstance(named, str):
             raise InputError(f"{self.path}: config: expected a path; found {named!r}")
@@ -325,7 +321,15 @@ class ChampionRecord:
             raise InputError(
                 f"{self.path}: config: expected the run's config.yaml; found no {source}"
             )
-        config = load_config(source, overrides)
+        return load_config(source, overrides)
+
+    def load_config(self, **overrides: object) -> Config:
+        """The run's configuration; where bodies have evolved, of the champion's body alone.
+
+        Raises:
+            InputError: there is no such file, or no body.
+        """
+        config = self.load_run_config(**overrides)
         if config.bodies is None:
             return config
         body = self.facts.get("morphology")

@@ -242,13 +242,15 @@ def _foretold(track: Track, settings: Any, moved: jax.Array) -> tuple[jax.Array,
 
     From one half to the next a robot turns by ψ and rises by some height. n displacements d, each
     turned by ψ from the one before, have the sum d sin(nψ/2) / sin(ψ/2), turned by (n - 1) ψ/2 from
-    the first: 0 for full circles.
+    the first: 0 for full circles. Halves are equal, and follow each other: of an odd number of
+    intervals the last is left out.
 
     Returns:
         `[2, lanes]` each [body lengths/s]: of the whole way, and of that at its depth.
     """
     half = max(1, moved.shape[0] // 2)
-    first, second = (jnp.sum(x, 0) for x in (moved[:half], moved[-half:]))
+    begins = 0, min(half, moved.shape[0] - half)
+    first, second = (jnp.sum(moved[k : k + half], 0) for k in begins)
     way = (safe_norm(tuple(first)) + safe_norm(tuple(second))) / 2
     ahead = first[0] * second[0] + first[1] * second[1]
     aside = first[0] * second[1] - first[1] * second[0]
@@ -259,7 +261,7 @@ def _foretold(track: Track, settings: Any, moved: jax.Array) -> tuple[jax.Array,
     straight = jnp.sinc(count * turn / np.pi) / jnp.sinc(turn / np.pi)
     heading = jnp.arctan2(first[1], first[0] + rests) + (count - 1) * turn
     height = track.position[:, 2] - track.start_height
-    begun, ended = jnp.mean(height[: half + 1], 0), jnp.mean(height[-half - 1 :], 0)
+    begun, ended = (jnp.mean(height[k : k + half + 1], 0) for k in begins)
     heights = begun + np.linspace(0, 1, _MOMENTS)[:, None] * count * (ended - begun)
     keeps = jnp.mean(_keeping(heights, settings.depth_tolerance), 0)
     towards = jnp.stack([jnp.cos(heading), jnp.sin(heading)])

@@ -286,12 +286,9 @@ def run_plans(
 
     Returns:
         The exit code: 0 when all are finished, 130 or 143 when interrupted, 1 when the disk refused
-        a file or no worker was left.
-
-    Raises:
-        InputError: a run cannot begin or go on.
+        a file or no worker was left, 2 when a run could not begin, go on or be judged.
     """
-    began, ran = time.perf_counter(), 0
+    began, ran, code = time.perf_counter(), 0, 0
     left = sum(step != "finished" for step in steps.values())
     width = len(str(len(steps)))
     with (
@@ -318,6 +315,11 @@ def run_plans(
                 print(f"{over}failed\ngo on: {again}", flush=True)
                 print(f"error: {plan.name}: {words}", file=sys.stderr)
                 return 1
+            except InputError as error:  # nothing of this run can be judged; the others go on
+                print(f"{over}failed", flush=True)
+                print(f"error: {plan.name}: {error}", file=sys.stderr)
+                code, left = 2, left - 1
+                continue
             except BaseException:
                 print(f"{over}failed", flush=True)
                 raise
@@ -332,7 +334,7 @@ def run_plans(
     if interrupts.signal and left:
         print(f"go on: {again}", flush=True)
         return interrupts.exit_code
-    return 0
+    return code
 
 
 def _run(

@@ -273,7 +273,7 @@ def correlation(problem: FitProblem, values: list[np.ndarray]) -> dict[str, floa
             square_sum = float(x[np.isfinite(x)] @ x[np.isfinite(x)])
             both = float(a[known] @ b[known]), square_sum, square_sum * len(x)
             lagged.setdefault(channel.kind, []).append(both)
-    found = {}
+    found = {channel.kind: 1.0 for channel in problem.channels}
     for kind, many in lagged.items():
         product, square_sum, weighted = (sum(x[k] for x in many) for k in range(3))
         rows = max(weighted / max(square_sum, 1e-30), 4.0)
@@ -467,4 +467,5 @@ def advance(problem: FitProblem, state: FitState, model: Model) -> tuple[FitStat
             break
         common = 10 * state.common if state.common else 1e-2
         state = replace(state, damping=damping, common=common)
-    return replace(state, iteration=state.iteration + 1, moved=0.0), model
+    state = replace(state, iteration=state.iteration + 1, moved=0.0)
+    return state, linearize(problem, state.point, state.steps)  # with these steps, as a resumed fit

@@ -357,7 +357,9 @@ def make_problem(
     end = np.array([v.end for v in views])
     held = _held_out(len(recordings), settings.held_out)
     share = 0.0 if held.any() else settings.held_out
-    until = np.where(held, -np.inf, end - share * (end - begin))
+    # A mean speed is one number, at the end.
+    tracks = np.array(["mean_speed" not in r.signals for r in recordings])
+    until = np.where(held, -np.inf, end - share * tracks * (end - begin))
     usual = np.where(held, end, until) - begin
     dt = robot.world.timestep
     window = float(min(settings.window, usual.max()))

@@ -241,7 +241,7 @@ def _name_columns(
         assert match is not None
         column, factor = match["column"], match["factor"]
         if column in header:
-            usual = 1.0 if factor else _unit(column)[1]
+            usual = 1.0 if factor or column == name else _unit(column)[1]
             found[name] = header.index(column), _factor(name, factor) if factor else usual
             continue
         try:
@@ -257,8 +257,11 @@ def _name_columns(
     twice = [column for column in header if header.count(column) > 1]
     if twice:
         raise InputError(f"column {twice[0]}: expected each name once; found it twice")
+    mapped = {k for k, _ in found.values()}
     for k, column in enumerate(header):
-        plain, factor = _unit(column)
+        head, _, rest = column.partition(".")
+        own = head in ("command", "angle") and rest in modules  # also one that ends like a unit
+        plain, factor = (column, 1.0) if own else _unit(column)
         plain = {"t": "time"}.get(plain, plain)
         if mark := re.fullmatch(r"([xyz])(\d+)", plain):
             plain = f"mark.{mark[2]}.{mark[1]}"
@@ -266,7 +269,7 @@ def _name_columns(
         known = plain == "time" or plain in _POSE or plain in _SENSED or head == "mark"
         if plain not in found and (known or (head in ("command", "angle") and rest in modules)):
             found[plain] = k, factor
-        elif head in ("command", "angle") and rest not in modules:
+        elif head in ("command", "angle") and rest not in modules and k not in mapped:
             raise InputError(
                 f"column {column}: expected a module of {robot.morphology.name} "
                 f"({', '.join(modules)}); found {show(rest)}: another robot?"
@@ -439,8 +442,16 @@ def _check_signals(
     """Plain faults, one line each; and notes about gaps."""
     modules = {m.name: m.kind for m in robot.morphology.modules}
     seen = [n for n in signals if n in _POSE or n in _SENSED or n.startswith("mark.")]
-    if not any(n in ("x", "y", "mean_speed") or n.startswith("mark.") for n in signals):
+    if not any(n in ("x", "mean_speed") or n.startswith("mark.") for n in signals):
         raise InputError("expected x and y of the core, marks, or mean_speed; found none of them")
+    quat = [f"q{axis}" for axis in "wxyz"]
+    for given, needed in ((("roll", "pitch"), ["qw" if "qw" in signals else "yaw"]), (quat, quat)):
+        there = [n for n in given if n in signals]
+        if there and (missing := [n for n in needed if n not in signals]):
+            raise InputError(
+                f"{there[0]}: expected {', '.join(missing)} beside it; found none, and an attitude "
+                "is four numbers, or three angles with yaw first of all"
+            )
     for name, signal in signals.items():
         if not np.isfinite(signal.value).all():
             raise InputError(f"{name}: expected finite numbers; found NaN or infinity")

@@ -54,6 +54,7 @@ class Prediction:
             of a recording of a mean speed, that [m/s].
         fitted: `[n, 3]` the same, with the coefficients found.
         before: `[n, 3]` with those that the robot had.
+        is_speed: whether it is of a mean speed.
     """
 
     name: str
@@ -62,6 +63,7 @@ class Prediction:
     recorded: np.ndarray
     fitted: np.ndarray
     before: np.ndarray
+    is_speed: bool = False
 
     def error(self, which: np.ndarray, held: bool) -> float:
         """Root mean square distance of `fitted` or `before` from what was recorded [m]."""
@@ -278,6 +280,9 @@ def _predict(problem: FitProblem, state: FitState) -> tuple[Prediction, ...]:
                 count = np.isfinite(wide).sum(2)
                 seen, *both = np.where(count > 0, np.nansum(wide, 2) / np.maximum(count, 1), np.nan)
             found.append(
-                Prediction(recording.name, channel.time, ~channel.fitted, seen, both[0], both[1])
-            )
+                Prediction(
+                    recording.name, channel.time, ~channel.fitted, seen, both[0], both[1],
+                    channel.kind == "speed",
+                )
+            )  # fmt: skip
     return tuple(sorted(found, key=lambda p: not p.held.all()))

@@ -102,6 +102,10 @@ def load_robot(
         if config.coefficients is not None:
             entries = load_coefficients(config.coefficients)
             body = replace(body, modules=correct_modules(body.modules, entries, "coefficients"))
+        if modules is not None:
+            raise InputError(
+                f"--modules: expected none, as {source} names its own; found {show(str(modules))}"
+            )
         modules, trim = config.modules, trim or config.trim == "neutral"
         if world is None:
             world, overrides = config.world_name, config.world_overrides

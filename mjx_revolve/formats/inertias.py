@@ -47,7 +47,8 @@ def propeller(part: Part) -> tuple[np.ndarray, float]:
     assert part.thruster is not None
     axis = np.asarray(part.thruster.axis)
     across = np.abs(axis) < 0.99 * np.abs(axis).max()
-    diameter = 0.9 * float(np.asarray(part.boxes[0].size)[across].min())
+    size = np.asarray(part.boxes[0].size)
+    diameter = 0.9 * float((size[across] if across.any() else size).min())
     square = diameter**2 / 16 * (np.eye(3) - np.outer(axis, axis))
     return spread(max(_ROTOR * part.mass, LEAST), part.thruster.position, square), diameter
 

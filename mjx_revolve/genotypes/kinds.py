@@ -87,6 +87,7 @@ def _guard(name: str, genotype: object, space: Space) -> Genotype:
         adopt=None if genotype.adopt is None else guarded("adopt"),
         to_plain=guarded("to_plain"),
         from_plain=guarded("from_plain"),
+        settle=guarded("settle"),
     )
 
 

@@ -186,12 +186,17 @@ def holm(p: ArrayLike) -> list[float]:
 
 
 def compare(groups: Mapping[str, ArrayLike], pairs: bool = True) -> Comparison:
-    """Tests whether groups of values, by name, differ; and each pair of them, if `pairs`."""
-    known = {name: _finite(values) for name, values in groups.items()}
+    """Tests whether groups of values, by name, differ; and each pair of them, if `pairs`.
+
+    A group of fewer than two values is not tested, and counts in no correction.
+    """
+    every = {name: _finite(values) for name, values in groups.items()}
+    known = {name: values for name, values in every.items() if len(values) > 1}
     two = list(combinations(known, 2)) if pairs else []
     corrected = holm([rank_test(known[a], known[b]) for a, b in two])
+    tested = dict(zip(two, corrected, strict=True))
     p = 1.0
-    if len(known) > 1 and min(map(len, known.values())) > 1:
+    if len(known) > 1:
         ends = np.cumsum([len(x) for x in known.values()])[:-1]
         ranks = np.split(stats.rankdata(np.concatenate(list(known.values()))), ends)
         found = stats.permutation_test(
@@ -199,7 +204,8 @@ def compare(groups: Mapping[str, ArrayLike], pairs: bool = True) -> Comparison:
             rng=np.random.default_rng(0),
         )  # fmt: skip
         p = float(found.pvalue)
-    return Comparison(p, dict(zip(two, corrected, strict=True)))
+    shown = combinations(every, 2) if pairs else ()
+    return Comparison(p, {pair: tested.get(pair, 1.0) for pair in shown})
 
 
 def _spread(*ranks: np.ndarray, axis: int) -> np.ndarray:

@@ -28,7 +28,13 @@ from mjx_revolve.fitting import (
     load_recording,
     make_noisy,
 )
-from mjx_revolve.fitting.estimate import costs_of, linearize, middles, normal_equations
+from mjx_revolve.fitting.estimate import (
+    correlation,
+    costs_of,
+    linearize,
+    middles,
+    normal_equations,
+)
 from mjx_revolve.fitting.identify import find_unknown, plan_motions
 from mjx_revolve.fitting.parameters import read_free, with_values
 from mjx_revolve.fitting.problem import NOISE, make_problem
@@ -116,6 +122,27 @@ def test_windows_are_cut_in_their_middles_and_never_where_nothing_is_fitted():
     assert np.flatnonzero(found).tolist() == [2, 5]
     assert not middles(resets, np.zeros((10, 1), bool), short).any()
     assert not middles(short, np.ones((10, 1), bool), short).any()
+
+
+def test_few_recordings_of_a_mean_speed_count_in_whole(auv):
+    """Of each there is one number, at its end: a share of it cannot be held out."""
+    time = np.arange(60) / 20
+    commands = {f"command.{n}": TimeSeries(time, 0 * time + 0.4) for n in ("port", "starboard")}
+    speed = TimeSeries(time[-1:], np.array([0.2]))
+    given = [RobotRecording(name, commands | {"mean_speed": speed}) for name in "ab"]
+    found = make_problem(auv, given, ["drag"], FitSettings())
+    assert [c.fitted.tolist() for c in found.channels] == [[True, True]] * 2
+
+
+def test_a_sensor_of_what_is_held_out_alone_inflates_nothing(auv, signals):
+    short = {name: TimeSeries(*(x[:120] for x in one)) for name, one in signals.items()}
+    filmed = make_noisy(short, seed=1).signals
+    seen = {n: one for n, one in filmed.items() if n != "z"}
+    deep = seen | {"depth": TimeSeries(filmed["z"].time, -filmed["z"].value)}
+    given = [RobotRecording(name, deep if name == "d" else seen) for name in "abcd"]
+    problem = make_problem(auv, given, ["drag"], FitSettings())
+    left = linearize(problem, problem.origin()).values
+    assert correlation(problem, left)["depth"] == 1.0
 
 
 def test_what_is_held_out_is_foretold_better_than_before(fitted):
@@ -292,6 +319,9 @@ BAD = {
 "other robot": (changed(**{"command.left_hip": np.zeros(60)}), "another robot"),
 "still": (changed(x=np.ones(60), y=np.ones(60), yaw=np.zeros(60)), "a robot that moves"),
 "no place": (changed(x=None, y=None), "expected x and y of the core, marks, or mean_speed"),
+"no x": (changed(x=None), "expected x and y of the core, marks, or mean_speed"),
+"no yaw": (changed(yaw=None, roll=np.zeros(60)), "roll: expected yaw beside it; found none"),
+"half a turn": (changed(qw=np.ones(60)), "qw: expected qx, qy, qz beside it; found none"),
 "semicolons": ("time;x;y\n0;1;2\n1;2;2\n", "commas between them; found semicolons"),
 "degrees": (changed(yaw=25 * np.arange(60.0)), "yaw: expected radians; found steps of 500 a"),
 "a jump": (changed(x=0.2 * np.arange(60) / 20 + 5.0 * (np.arange(60) > 30)),
@@ -348,6 +378,19 @@ def test_errors_are_of_what_was_recorded():
     fit = Prediction("swim", np.arange(3.0), none, found, found + 0.1, found)
     assert fit.error(fit.fitted, False) == pytest.approx(0.1 * np.sqrt(3))
     assert fit.error(fit.before, False) == 0 and np.isnan(fit.error(fit.fitted, True))
+
+
+def test_names_of_modules_may_end_like_units(tmp_path):
+    arm = {"id": "arm", "body": {"id": "core", "type": "Core", "children": {
+        0: {"id": "leg_m", "type": "ActiveHinge", "children": {
+            1: {"id": "foot", "type": "FixedBrick"}}}}}}  # fmt: skip
+    robot = build_robot(make_morphology(arm), load_world("lake", bed="off"))
+    columns = {"command.leg_m": np.full(60, 0.3), "angle.leg_m_deg": np.full(60, 90.0)}
+    write_csv(tmp_path / "swim.csv", changed(**columns | {"command.port": None}))
+    for mapped in ([], ["command.leg_m=command.leg_m"]):
+        found = load_recording(tmp_path / "swim.csv", robot, read_map(mapped)).signals
+        assert found["command.leg_m"].value == pytest.approx(0.3)
+        assert found["angle.leg_m"].value == pytest.approx(np.pi / 2)
 
 
 def test_units_gaps_and_factors_of_columns(auv, tmp_path):

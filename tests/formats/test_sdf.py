@@ -1,5 +1,6 @@
 """SDF: its poses, masses and water, by a reader of our own and by Gazebo's in Drake."""
 
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -7,7 +8,9 @@ import pytest
 
 from exports import NAMES, lake_robot
 from laboratory import body
+from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.formats.inertias import propeller
 from mjx_revolve.formats.links import make_links, rest_pose
 from mjx_revolve.formats.sdf import make_sdf
 from mjx_revolve.numerics.spatial import quat_to_matrix
@@ -170,6 +173,13 @@ def test_sdf_refers_to_what_is_there(robot):
     for plugin in thrusters:
         assert float(plugin.findtext("max_thrust_cmd")) == pytest.approx(0.5)
         assert float(plugin.findtext("min_thrust_cmd")) == pytest.approx(-0.5)
+
+
+def test_a_thruster_along_a_diagonal_has_a_propeller():
+    part = next(p for m in load_morphology("auv").modules for p in m.kind.parts if p.thruster)
+    thruster = replace(part.thruster, axis=(3**-0.5,) * 3)
+    diameter = propeller(replace(part, thruster=thruster))[1]
+    assert diameter == pytest.approx(0.9 * min(part.boxes[0].size))
 
 
 def test_sdf_of_a_world_without_water_has_none_and_its_bed_is_there():

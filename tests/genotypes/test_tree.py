@@ -68,6 +68,15 @@ def test_subtrees_are_duplicated():
     assert max(body.num_modules for body in only("duplicate")) == 10
 
 
+def test_a_genotype_of_ones_own_may_be_this_one_and_its_copies_know_their_originals(tmp_path):
+    (tmp_path / "mine.py").write_text(
+        "from mjx_revolve.genotypes.tree import make_tree\n"
+        "def wrapped(space, params):\n    return make_tree(space, {}, 'mine')\n"
+    )
+    settle = find_genotype(f"{tmp_path}/mine.py:wrapped", SPACE, {}, "test.yaml").settle
+    assert settle(only("mirror")[0])[1]
+
+
 @pytest.mark.parametrize("kind", ["duplicate", "mirror"])
 def test_copies_know_their_originals(kind):
     """So do copies of copies, and those in the place of a limb of the same name."""

@@ -75,5 +75,7 @@ def test_groups_are_compared_together_and_in_pairs():
     assert found.p == pytest.approx(6 / 1680)
     assert statistics.compare({"a": [1, 2, 3], "b": [4, 5, 6]}) == (0.1, {("a", "b"): 0.1})
     assert found.pairs == pytest.approx({("a", "b"): 0.3, ("a", "c"): 0.3, ("b", "c"): 0.3})
+    alone = statistics.compare({"a": [1, 2, 3], "b": [4, 5, 6], "c": [7]})
+    assert alone == (0.1, {("a", "b"): 0.1, ("a", "c"): 1, ("b", "c"): 1})
     assert statistics.compare({"a": [1, 1], "b": [1, 1]}).p == 1
     assert statistics.compare({"a": [1, 2]}) == (1, {})

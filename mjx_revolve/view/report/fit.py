@@ -34,7 +34,7 @@ def make_fit_page(fit: Fit) -> str:
     figures = []
     for p in fit.predictions[:1]:
         held = bool(p.held.any())
-        unit = "m/s" if _is_speed(p) else "m"
+        unit = "m/s" if p.is_speed else "m"
         what = "off, held out" if held else "off, fitted"
         figures += [(f"{p.error(p.fitted, held):.2g} {unit}", what),
                     (f"{p.error(p.before, held):.2g} {unit}", "before the fit")]  # fmt: skip
@@ -44,26 +44,22 @@ def make_fit_page(fit: Fit) -> str:
     return make_page(f"{problem.robot.morphology.name}: water fitted", words, lead, content)
 
 
-def _is_speed(p: Prediction) -> bool:
-    return bool(np.isnan(p.recorded[:, 1]).all())
-
-
 def _predictions(fit: Fit) -> str:
     rows = []
     for p in fit.predictions:
-        unit = "m/s" if _is_speed(p) else "m"
+        unit = "m/s" if p.is_speed else "m"
         for held in (True, False):
             part = p.held if held else ~p.held
             if part.any():
                 rows.append((p.name, "held out" if held else "fitted",
                              f"{p.error(p.before, held):.3g} {unit}",
                              f"{p.error(p.fitted, held):.3g} {unit}",
-                             "" if _is_speed(p) else f"{p.way:.3g} m"))  # fmt: skip
+                             "" if p.is_speed else f"{p.way:.3g} m"))  # fmt: skip
     rows.sort(key=lambda row: row[1] != "held out")
     header = ("recording", "what", "off, before", "off, fitted", "its way")
-    tracks = [p for p in fit.predictions if not _is_speed(p)]
+    tracks = [p for p in fit.predictions if not p.is_speed]
     pictures = [(p.name, svg_source(plot_prediction(p))) for p in tracks[:8]]
-    speeds = [p for p in fit.predictions if _is_speed(p)]
+    speeds = [p for p in fit.predictions if p.is_speed]
     if speeds:
         pictures.append(("mean speeds", svg_source(plot_speeds(speeds))))
     return sections.fit_predictions(header, rows, pictures)

@@ -225,7 +225,9 @@ def _tests(members: Numbered, cases: Sequence[str]) -> str:
         ]
         for (a, b), p in found.pairs.items()
     ]  # fmt: skip
-    least = smallest_p(counts[-1], counts[-2], len(rows)) if rows else 1.0
+    several = sum(count > 1 for count in counts)
+    pairs = several * (several - 1) // 2
+    least = smallest_p(counts[-1], counts[-2], pairs) if rows else 1.0
     return sections.sweep_tests(_p(found.p), said, rows, f"{least:.2g}", ALPHA, _MOST_TESTED)
 
 
