@@ -1,13 +1,16 @@
 """What is shown of a colony: its history from logs, pictures, report, and the page of a replay."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 import yaml
 
 from mjx_revolve import report, viewer
+from mjx_revolve.episodes.champion import load_episode
 from mjx_revolve.episodes.individual_log import Event, read_events
+from mjx_revolve.episodes.tasks import COLONY_FITNESS
 from mjx_revolve.evolution.colony_observer import open_colony
 from mjx_revolve.evolve import main
 from mjx_revolve.inputs.commands import run_command
@@ -117,6 +120,15 @@ def test_the_report_of_a_colony(run, tmp_path):
     assert "own generation's starts" not in text and "After generation" not in text
     assert "intervals" in text and "fitness in the colony" in text
     assert read_run(run).history.spans.keys() == read_run(run).population.lives.keys()
+    # Before its end the fittest is known by its life, and not by a task's score.
+    shutil.copytree(run, tmp_path / "run")
+    info = json.loads((tmp_path / "run" / "run.json").read_text())
+    del info["finished"]
+    (tmp_path / "run" / "run.json").write_text(json.dumps(info))
+    best = tmp_path / "run" / "champion" / "genes.yaml"
+    best.write_text(yaml.safe_dump(yaml.safe_load(best.read_text()) | {"final": False}))
+    episode = load_episode(tmp_path / "run")
+    assert (episode.starts, episode.score_unit) == ("its life", COLONY_FITNESS)
 
 
 @pytest.mark.long
