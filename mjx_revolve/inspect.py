@@ -73,7 +73,8 @@ def main(argv: list[str] | None = None) -> int:
             print("\n".join(map(plain, table)), end="\n\n")
     print("\n".join(summary(morphology, arguments.density, arguments.gravity)))
     passport = Path(arguments.file).parent / "passport.yaml"
-    if Path(arguments.file).is_file() and passport.is_file():
+    in_run = passport.parent.name == "champion" and Path(arguments.file).is_file()
+    if in_run and passport.is_file():
         from mjx_revolve.episodes.passport import load_passport
 
         print(f"\nchampion of a run: {load_passport(passport).mark or 'passes its passport'}")

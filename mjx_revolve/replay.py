@@ -176,6 +176,7 @@ def main(argv: list[str] | None = None) -> int:
     if paths is None and folder is not None:
         kinds = kinds[:1] if several else kinds
         paths = _paths_in(folder, name, kinds)
+        check_place(folder / name, str(folder))
     check_episode_path(path)
     check_colony_arguments(arguments)
     if ".mp4" in (kinds if paths is None else paths):

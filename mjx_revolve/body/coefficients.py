@@ -16,15 +16,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.params import apply_overrides, check_overrides, multiply_factors
 from mjx_revolve.body.placement import Module
 from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.files import path_inside, read_file
 from mjx_revolve.inputs.schema import checked, read
-from mjx_revolve.inputs.yaml_reader import load_yaml, parse_yaml
+from mjx_revolve.inputs.yaml_reader import dump_yaml, load_yaml, parse_yaml
 
 ALL = "all"
 Entries = Mapping[str, Mapping[str, Any]]
@@ -141,5 +139,5 @@ def read_morphology_files(path: str | Path) -> dict[str, bytes]:
     if beside != Path(named).as_posix():
         beside = beside if beside != path.name else f"coefficients_{beside}"
         data["coefficients"] = beside
-        found[path.name] = yaml.safe_dump(data, sort_keys=False, allow_unicode=True).encode()
+        found[path.name] = dump_yaml(data).encode()
     return found | {beside: content}

@@ -22,7 +22,7 @@ from mjx_revolve.body.module_types import Part, Vector
 from mjx_revolve.body.placement import Module, RestPose, frozen, rest_pose, same
 from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.inputs.yaml_reader import SafeLoader
+from mjx_revolve.inputs.yaml_reader import dump_yaml
 
 COLORS = ("red", "green", "blue")
 
@@ -269,16 +269,6 @@ def _unpack(
     return Morphology(name, tuple(modules), brain, path, overlaps, sensors)
 
 
-class _Dumper(yaml.SafeDumper):
-    """Quotes texts that our own reader would take for a number (`1e-3`)."""
-
-    yaml_implicit_resolvers = SafeLoader.yaml_implicit_resolvers
-
-    def ignore_aliases(self, data: object) -> bool:
-        """Writes shared values in full."""
-        return True
-
-
 def save_morphology(morphology: Morphology, path: str | Path) -> None:
     """Writes a robot's body as YAML that `load_morphology` reads back to an equal morphology.
 
@@ -293,7 +283,7 @@ def save_morphology(morphology: Morphology, path: str | Path) -> None:
     """
     try:
         data = morphology.to_mapping()
-        text = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+        text = dump_yaml(data)
         Path(path).write_text(text, encoding="utf-8")
     except (ValueError, RecursionError, yaml.YAMLError) as error:
         found = str(error).splitlines()[0]

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from annotated_types import Ge, Le, Lt, MinLen, Unit
 from pydantic import (
     AfterValidator,
@@ -61,7 +60,7 @@ from mjx_revolve.inputs.schema import (
 from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.inputs.trust import is_run_config
 from mjx_revolve.inputs.validation_messages import describe, find_problems, refuse
-from mjx_revolve.inputs.yaml_reader import load_yaml
+from mjx_revolve.inputs.yaml_reader import dump_yaml, load_yaml
 from mjx_revolve.water.world import World, is_left_out
 
 # Required settings of each task; `tasks.TASKS` has the tasks themselves.
@@ -708,4 +707,4 @@ def dump_config(config: Config, folder: str | Path | None = None) -> str:
         return file.at(path.relative_to(root).as_posix())
 
     data = map_files(copy_plain(config.model_dump()), shorten, Config)
-    return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    return dump_yaml(data, default_flow_style=None)

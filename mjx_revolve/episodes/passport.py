@@ -17,7 +17,6 @@ from typing import Annotated, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import yaml
 from jaxtyping import PyTree
 from pydantic import Strict
 
@@ -36,7 +35,7 @@ from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.episodes.starts import Starts, draw_gusts
 from mjx_revolve.inputs.errors import reading
 from mjx_revolve.inputs.schema import Text, checked, read
-from mjx_revolve.inputs.yaml_reader import load_yaml
+from mjx_revolve.inputs.yaml_reader import dump_yaml, load_yaml
 from mjx_revolve.numerics.xla import over_chunks
 from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.drag import find_drag_law
@@ -163,7 +162,7 @@ class Passport:
             for name, check in self.checks.items()
         }
         data = {"passed": not self.failed, "checks": checks}
-        return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
+        return dump_yaml(data)
 
 
 def load_passport(path: Path) -> Passport:

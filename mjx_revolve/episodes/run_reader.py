@@ -77,7 +77,7 @@ class RunReader:
         content = read_file(path)
         try:
             info = json.loads(content)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: expected JSON; found: {error}") from None
         if not isinstance(info, dict):
             raise InputError(f"{path}: expected a JSON object; found {type(info).__name__}")
@@ -293,7 +293,7 @@ class ChampionRecord:
     def score(self) -> float | None:
         """Its score; None where that is not known."""
         score = self.facts.get("score")
-        return float(score) if isinstance(score, int | float) else None
+        return float(score) if isinstance(score, int | float) and abs(score) < 1e300 else None
 
     @property
     def is_final(self) -> bool:

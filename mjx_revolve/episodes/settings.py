@@ -216,8 +216,8 @@ def find_copies(folder: Path) -> dict[str, Path]:
     """
     try:
         listed = json.loads((folder / "run.json").read_bytes()).get("inputs", {})
-    except (OSError, ValueError, AttributeError):  # reported by the reader of the other fields
-        return {}
+    except (OSError, ValueError, RecursionError, AttributeError):
+        return {}  # reported by the reader of the other fields
     found = {}
     for name, digest in listed.items() if isinstance(listed, dict) else ():
         path = resolve_inside(name, folder)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import itertools
+import json
 import logging
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -498,7 +499,8 @@ def _portable(settings: Sequence[str], config: Config) -> list[str]:
     for setting in settings:
         key, _, value = setting.partition("=")
         text = None if value.lstrip().startswith(("{", "[")) else texts.get(key.strip())
-        portable.append(f"{key}={text}" if text else setting)
+        # As YAML: a folder's name may hold ` #` or `: `.
+        portable.append(f"{key}={json.dumps(text, ensure_ascii=False)}" if text else setting)
     return portable
 
 

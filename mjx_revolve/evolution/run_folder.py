@@ -31,7 +31,6 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-import yaml
 
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.episodes.config import Config, dump_config, make_config, state_world
@@ -54,6 +53,7 @@ from mjx_revolve.evolution.archive import Archive, filled, from_arrays
 from mjx_revolve.inputs.commands import check_no_sweep
 from mjx_revolve.inputs.errors import InputError, reading, show
 from mjx_revolve.inputs.files import check_path, naming, resolve_inside, write_atomic
+from mjx_revolve.inputs.yaml_reader import dump_yaml
 
 try:
     import fcntl
@@ -223,7 +223,7 @@ class RunFolder(RunReader):
             self.write("champion/morphology.yaml", body.save)
             data["morphology"] = "morphology.yaml"
         data["genes"] = [float(gene) for gene in genes]
-        text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None)
+        text = dump_yaml(data, default_flow_style=None)
         self.write("champion/genes.yaml", text.encode())
 
     def close(self) -> None:
@@ -242,7 +242,8 @@ class RunFolder(RunReader):
 def _info_text(info: Mapping[str, object]) -> bytes:
     """The text of `run.json`; entries that are None are left out."""
     kept = {key: value for key, value in info.items() if value is not None}
-    return (json.dumps(kept, indent=2, ensure_ascii=False) + "\n").encode()
+    text = json.dumps(kept, indent=2, ensure_ascii=False) + "\n"
+    return text.encode(errors="backslashreplace")  # folders may have names of any bytes
 
 
 def _config_text(config: Config, folder: Path) -> bytes:

@@ -19,7 +19,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
-import yaml
 from annotated_types import Ge, Le, MinLen
 
 from mjx_revolve.episodes.config import Config, load_config
@@ -38,7 +37,7 @@ from mjx_revolve.inputs.files import SWEEP, short_path, write_atomic
 from mjx_revolve.inputs.grids import MOST_SEEDS, combine, read_axes
 from mjx_revolve.inputs.schema import Integer, Text, TupleOf, checked, read
 from mjx_revolve.inputs.trust import opening, opening_config
-from mjx_revolve.inputs.yaml_reader import load_yaml
+from mjx_revolve.inputs.yaml_reader import dump_yaml, load_yaml
 
 
 class Plan(NamedTuple):
@@ -205,7 +204,7 @@ def write_sweep(folder: Path, sweep: Sweep) -> None:
     """Writes `sweep.yaml`."""
     data = {"config": sweep.config, "seeds": sweep.seeds, "settings": list(sweep.settings)}
     data |= {"first_seed": sweep.first_seed} if sweep.first_seed else {}
-    text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
+    text = dump_yaml(data)
     write_atomic(folder / SWEEP, f"# What the runs of this folder are.\n{text}".encode())
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import yaml
 
 from mjx_revolve.body.params import multiply_factors
 from mjx_revolve.engine.robot import Robot
@@ -18,6 +17,7 @@ from mjx_revolve.fitting.intervals import LEVEL, Estimate, estimate
 from mjx_revolve.fitting.parameters import with_values
 from mjx_revolve.fitting.problem import FitProblem, FitSettings, make_problem
 from mjx_revolve.fitting.recording import RobotRecording
+from mjx_revolve.inputs.yaml_reader import dump_yaml
 
 
 @dataclass(frozen=True)
@@ -147,11 +147,7 @@ class Fit:
         lines += [f"# {u.words}." for u in self.unknown]
         if any(m.params.get("factors") for m in self.problem.robot.morphology.modules):
             lines.append("# On top of the factors that the robot had; robot.yaml has all of them.")
-        return (
-            "\n".join(lines)
-            + "\n"
-            + yaml.safe_dump({"modules": self.coefficients}, sort_keys=False)
-        )
+        return "\n".join(lines) + "\n" + dump_yaml({"modules": self.coefficients})
 
     def to_json(self) -> str:
         """All numbers, for other programs."""

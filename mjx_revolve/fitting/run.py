@@ -28,7 +28,7 @@ from mjx_revolve.inputs.files import read_file, write_atomic
 from mjx_revolve.inputs.overrides import read_overrides
 from mjx_revolve.inputs.schema import read
 from mjx_revolve.inputs.shipped import find_shipped, list_shipped
-from mjx_revolve.inputs.yaml_reader import load_yaml
+from mjx_revolve.inputs.yaml_reader import dump_yaml, load_yaml
 from mjx_revolve.numerics import runtime
 from mjx_revolve.water.world import load_world, read_world_files
 
@@ -171,7 +171,7 @@ class FitRun:
             kind="fit", started=timestamp(), seed=request.seed, **runtime.describe_process(),
         )  # fmt: skip
         save_morphology(request.robot.morphology, folder.path / "inputs" / "robot.yaml")
-        text += yaml.safe_dump(config, sort_keys=False)
+        text += dump_yaml(config)
         write_atomic(folder.path / "config.yaml", text.encode())
         return cls(folder, request, problem)
 
@@ -290,7 +290,7 @@ def _pack(recordings: Sequence[RobotRecording]) -> bytes:
         marks = {name: [mark.module, *mark.place] for name, mark in recording.marks.items()}
         about.append({"name": recording.name, "marks": marks, "notes": list(recording.notes)})
     buffer = io.BytesIO()
-    text = yaml.safe_dump(about).encode()
+    text = dump_yaml(about).encode()
     np.savez_compressed(buffer, about=np.frombuffer(text, np.uint8), **arrays)  # type: ignore[arg-type]
     return buffer.getvalue()
 

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.module_files import read_modules
@@ -24,6 +23,7 @@ from mjx_revolve.formats.links import plain
 from mjx_revolve.formats.rigid_links import RigidLink, RigidRobot, Shape, read_rigid_robot
 from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.inputs.yaml_reader import check_size, dump_yaml
 
 # Edge of the box of a part without water or contact [m]: a choice, small against a link.
 _SPECK = 1e-4
@@ -66,7 +66,7 @@ class ImportedRobot:
         """
         paths = self.paths(folder)
         for path, data in zip(paths, self.files, strict=True):
-            text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
+            text = dump_yaml(data, default_flow_style=None, width=100)
             write_atomic(path, text.encode())
         return paths
 
@@ -98,6 +98,7 @@ def _make(robot: RigidRobot) -> ImportedRobot:
     items: list[dict[str, Any]] = []
     missing = robot.missing
     names = _names([link.name for link in robot.links])
+    taken = {*names, *MODULES}
     for link, name in zip(robot.links, names, strict=True):
         shapes = link.solid or link.seen
         turn = _frame(link, shapes)
@@ -111,7 +112,9 @@ def _make(robot: RigidRobot) -> ImportedRobot:
             item["params"] = color
         items.append(item)
         for number, (part, slot) in enumerate(welded, 1):
-            own = f"{name}_{number}"
+            numbered = (f"{name}_{k}" for k in itertools.count(number))
+            own = next(one for one in numbered if one not in taken)
+            taken.add(own)
             kinds[own] = {"mount": {"position": [0.0, 0.0, 0.0], "outward": [1.0, 0.0, 0.0]},
                           "parts": [part]}  # fmt: skip
             _attach(kinds[name], item, slot, {"id": own, "type": own} | _color(item))
@@ -120,6 +123,7 @@ def _make(robot: RigidRobot) -> ImportedRobot:
             slot = _slot(above.T @ link.position, above.T @ link.rotation @ turn)
             _attach(kinds[names[link.parent]], items[link.parent], slot, item)
     files = {"id": plain(robot.name), "body": items[0]}, {"modules": kinds}
+    check_size(files[0])  # what is saved is to be read again
     modules = {**MODULES, **read_modules(files[1], {})}
     morphology = make_morphology(files[0], modules, allow_overlap=True)
     if morphology.overlaps:
@@ -217,6 +221,10 @@ def _module(
     body[:3, :3] = turn.T
     inertia = body @ link.inertia @ body.T
     if mass > 0:
+        center = inertia[:3, 3] / mass
+        square = inertia[:3, :3] / mass - np.outer(center, center)
+        if np.linalg.eigvalsh(square)[0] < -1e-6 * abs(np.trace(square)):
+            missing.append(f"{link.name}: an inertia that no body has; the nearest one is taken")
         parts += _with_mass(own, inertia, whole=not welded)
     elif link.parent >= 0:
         raise InputError(f"{link.name}: expected a mass, as a hinge moves it; found none")
@@ -228,6 +236,10 @@ def _hinge(link: RigidLink, turn: np.ndarray, missing: list[str]) -> dict[str, A
     low, high = link.limits.get("range", (-_WHOLE, _WHOLE))
     if "range" not in link.limits:
         missing.append(f"{link.name}: turns all the way; here from -π to π")
+    if low > high:
+        raise InputError(
+            f"{link.name}: expected a range [lowest, highest]; found [{low:g}, {high:g}]"
+        )
     if not low <= 0 <= high or low == high:
         missing.append(f"{link.name}: its range [{low:g}, {high:g}] lacks the rest pose, 0")
         low, high = min(low, 0.0), max(high, 0.0) + (low == high == 0) * 1e-3

@@ -7,6 +7,7 @@ are fixed to another one are merged into it. Unsupported properties are named in
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -214,6 +215,9 @@ def _then(first: Place, second: Place) -> Place:
 def _read_urdf(root: Element, path: Path) -> RigidRobot:
     robot = RigidRobot(root.get("name") or path.stem)
     links = {link.get("name", ""): link for link in root.findall("link")}
+    for name, count in Counter(link.get("name", "") for link in root.findall("link")).items():
+        if count > 1:
+            raise InputError(f"link {name}: expected each name once; found {count} of it")
     below: dict[str, list[Element]] = {}
     children = set()
     for joint in root.findall("joint"):
@@ -305,7 +309,10 @@ def _shape(
         if mesh is None:
             missing.append(f"{link}: the mesh {kind.get('filename')}, which cannot be read")
             return
-        triangles = mesh * _numbers(kind, "scale", 3, "1 1 1")
+        scale = _numbers(kind, "scale", 3, "1 1 1")
+        triangles = mesh * scale
+        if scale.prod() < 0:  # a mirror turns triangles inside out
+            triangles = triangles[:, ::-1]
         yield _mesh(triangles, place, rgb, link, missing)
         return
     if kind is None or kind.tag not in ("box", "sphere", "cylinder", "capsule"):
@@ -335,10 +342,12 @@ def _load_mesh(name: str, path: Path) -> np.ndarray | None:
     found = (folder / tail for folder in folders for tail in tails)
     file = next((one for one in found if one.is_file()), None)
     try:
-        mesh = None if file is None else trimesh.load_mesh(file)
-        return None if mesh is None else np.asarray(mesh.triangles)
-    except (ValueError, NotImplementedError, ImportError, AttributeError, IndexError):
+        triangles = np.zeros(0) if file is None else np.asarray(trimesh.load_mesh(file).triangles)
+    except OSError:
+        raise
+    except Exception:  # its readers raise anything
         return None
+    return triangles if triangles.size and np.isfinite(triangles).all() else None
 
 
 def _urdf_hinge(joint: Element, missing: list[str]) -> _Hinge | None:
@@ -350,6 +359,9 @@ def _urdf_hinge(joint: Element, missing: list[str]) -> _Hinge | None:
         return None
     if joint.find("mimic") is not None:
         missing.append(f"{name}: it mimics another joint; here it is free")
+    dynamics = joint.find("dynamics")
+    if any(_numbers(dynamics, given, 1, "0")[0] for given in ("damping", "friction")):
+        missing.append(f"{name}: damping and friction; here those of our servos")
     limit = joint.find("limit")
     limits: dict[str, Any] = {}
     if limit is not None:
@@ -371,6 +383,7 @@ _KINDS = {
     _GEOM.mjGEOM_BOX: "box", _GEOM.mjGEOM_SPHERE: "sphere", _GEOM.mjGEOM_ELLIPSOID: "ellipsoid",
     _GEOM.mjGEOM_CYLINDER: "cylinder", _GEOM.mjGEOM_CAPSULE: "capsule",
 }  # fmt: skip
+_GREY = 0.5, 0.5, 0.5, 1.0  # MuJoCo's default
 _COLLIDES = 3
 """The first group of geoms that MuJoCo's viewer hides: those that carry mass and contact."""
 
@@ -417,8 +430,9 @@ def _read_mjcf(root: Element, path: Path) -> RigidRobot:
         ((model.geom_bodyid == 0).sum(), "geoms of the world"), (model.neq, "equality constraints"),
         (model.ntendon, "tendons"), (model.nsensor, "sensors"),
         (model.dof_frictionloss.any(), "friction of joints"),
+        (model.dof_damping.any(), "damping of joints"), (model.dof_armature.any(), "armatures"),
         (model.jnt_stiffness.any(), "springs of joints"),
-        (model.opt.density or model.opt.viscosity, "MuJoCo's fluid"),
+        (np.bool_(model.opt.density or model.opt.viscosity), "MuJoCo's fluid"),
     ):  # fmt: skip
         if count:
             missing.append(words if isinstance(count, np.bool_) else f"{count:g} × {words}")
@@ -456,7 +470,10 @@ def _mjcf_shape(
     """Adds a geom to its link."""
     kind = _GEOM(model.geom_type[geom])
     there = _then(place, (model.geom_pos[geom], quat_to_matrix(model.geom_quat[geom])))
-    rgb = tuple(model.geom_rgba[geom][:3].astype(float))
+    rgba, material = model.geom_rgba[geom], model.geom_matid[geom]
+    if material >= 0 and np.allclose(rgba, _GREY):  # a geom without a colour of its own
+        rgba = model.mat_rgba[material]
+    rgb = tuple(rgba[:3].astype(float))
     collides = model.geom_contype[geom] or model.geom_conaffinity[geom]
     shapes = link.solid if collides or model.geom_group[geom] >= _COLLIDES else link.seen
     if kind == _GEOM.mjGEOM_MESH:

@@ -65,10 +65,16 @@ class Parser(argparse.ArgumentParser):
         raise InputError(f"{message.removeprefix('argument ')} (see --help)")
 
 
-def read_path(text: str) -> str:
-    """Reads a path, for `add_argument(type=read_path)`; refuses "" (an unset shell variable)."""
+def refuse_blank(text: str, what: str = "an address or a file") -> str:
+    """Reads a text, for `add_argument(type=refuse_blank)`; refuses "" (an unset shell variable)."""
     if not text.strip():
-        raise argparse.ArgumentTypeError(f"expected a path; found {text!r}")
+        raise argparse.ArgumentTypeError(f"expected {what}; found {text!r}")
+    return text
+
+
+def read_path(text: str) -> str:
+    """Reads a path, for `add_argument(type=read_path)`; refuses ""."""
+    refuse_blank(text, "a path")
     try:
         check_path(text)
     except InputError as error:
@@ -122,7 +128,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
         help="processes on this machine (default: its cores)",
     )  # fmt: skip
     parser.add_argument(
-        "--cluster", metavar="SCHEDULER",
+        "--cluster", type=refuse_blank, metavar="SCHEDULER",
         help="a Dask scheduler's address, or its scheduler file: its workers score",
     )  # fmt: skip
 

@@ -26,6 +26,7 @@ def check_path(path: object) -> Path:
     if not isinstance(path, str | Path):
         raise InputError(f"expected a path; found {show(path)}")
     try:
+        str(path).encode()
         os.stat(path)
     except ValueError:
         raise InputError(

@@ -1,4 +1,7 @@
-"""Safe YAML: reads `1e-3` as a number; refuses duplicate keys, deep nesting and huge documents."""
+"""Safe YAML: reads `1e-3` as a number; refuses duplicate keys, deep nesting and huge documents.
+
+What is written is read back as it was.
+"""
 
 from __future__ import annotations
 
@@ -113,7 +116,8 @@ for _name in ("binary", "omap", "pairs", "set"):  # bytes, tuples and sets: no f
     SafeLoader.add_constructor(f"tag:yaml.org,2002:{_name}", _refuse_tag)
 
 
-def _check_size(data: object) -> None:
+def check_size(data: object) -> None:
+    """Raises `InputError` for values that are nested too deeply, or too many, to be read."""
     stack, count = [(data, 0)], 0
     while stack:
         item, depth = stack.pop()
@@ -148,7 +152,7 @@ def parse_yaml(content: bytes, path: str | Path) -> Any:
         text = content.decode("utf-8")
         try:
             data = yaml.load(text, Loader=SafeLoader)
-            _check_size(data)
+            check_size(data)
         except RecursionError:
             raise _too_deep() from None
         except yaml.YAMLError as error:
@@ -157,3 +161,18 @@ def parse_yaml(content: bytes, path: str | Path) -> Any:
             problem = getattr(error, "problem", None) or str(error).splitlines()[0]
             raise InputError(f"{place}expected valid YAML; found: {problem}") from None
     return data
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes texts that `SafeLoader` would take for a number (`1e3`)."""
+
+    yaml_implicit_resolvers = SafeLoader.yaml_implicit_resolvers
+
+    def ignore_aliases(self, data: object) -> bool:
+        """Writes shared values in full."""
+        return True
+
+
+def dump_yaml(data: object, **style: Any) -> str:
+    """Plain values as YAML, mappings in their order; `style` as `yaml.dump` has it."""
+    return str(yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, **style))

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import yaml
 from annotated_types import Ge, Le, MinLen, Unit
 from pydantic import BeforeValidator, InstanceOf, ValidationInfo
 
@@ -37,7 +36,7 @@ from mjx_revolve.inputs.schema import (
     words,
 )
 from mjx_revolve.inputs.shipped import list_shipped
-from mjx_revolve.inputs.yaml_reader import load_yaml
+from mjx_revolve.inputs.yaml_reader import dump_yaml, load_yaml
 from mjx_revolve.water.bed import Bed
 from mjx_revolve.water.coefficients import TODAY
 from mjx_revolve.water.currents import (
@@ -312,5 +311,5 @@ def read_world_files(path: str | Path) -> dict[str, bytes]:
     beside = path_inside(named)
     if beside != Path(named).as_posix():
         data["current_field"] = beside
-        content = yaml.safe_dump(data, sort_keys=False, allow_unicode=True).encode()
+        content = dump_yaml(data).encode()
     return {path.name: content, beside: field}

@@ -177,6 +177,12 @@ def test_dump_reads_back_equal(folder):
     assert "morphology: robot.yaml" in inside
     (folder / "inside.yaml").write_text(inside)
     assert load_config(folder / "inside.yaml").model_dump() == config.model_dump()
+    # Texts that look like numbers stay texts.
+    (folder / "tasks.py").write_text("def score(track, settings):\n    return track.duration\n")
+    own = ["task.type=../tasks.py:score", "task.params={tag: '1e3', word: '-.5'}"]
+    config = load_config(folder / "good.yaml", own)
+    (folder / "inside.yaml").write_text(dump_config(config, folder))
+    assert load_config(folder / "inside.yaml").model_dump() == config.model_dump()
 
 
 def test_own_functions_are_found_from_where_they_are_named(folder):

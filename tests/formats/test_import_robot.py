@@ -12,6 +12,7 @@ from mjx_revolve.formats import import_robot, make_links, make_meshes, make_mjcf
 from mjx_revolve.formats.rigid_links import box_around, closed_volume
 from mjx_revolve.importer import main
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.yaml_reader import dump_yaml
 
 WATER = load_world("lake")
 # A root whose inertia is turned, a foot fixed to its leg, boxes and cylinders at angles.
@@ -234,7 +235,10 @@ def test_the_command_writes_what_other_commands_read(tmp_path, capsys, monkeypat
 ('"0.4"', '"heavy"', "<mass> value: expected 1 numbers; found 'heavy'"),
 ('"0.4"', '"0"', "base: expected a root with a mass; found none"),
 ('<child link="left"', '<child link="lft"', "joint hip: expected a link of the file; f"),
-("</robot>", '<link name="alone"/></robot>', "expected one root link; found base, alone")
+("</robot>", '<link name="alone"/></robot>', "expected one root link; found base, alone"),
+("</robot>", '<link name="rod"/></robot>', "link rod: expected each name once; found 2 of it"),
+('lower="-0.5" upper="1.2"', 'lower="1.2" upper="-0.5"', "hip: expected a range [lowest, highest]; "
+ "found [1.2, -0.5]"),
 ],
 )  # fmt: skip
 def test_what_is_wrong_is_said_in_a_line(old, new, expected, tmp_path):
@@ -243,6 +247,64 @@ def test_what_is_wrong_is_said_in_a_line(old, new, expected, tmp_path):
     with pytest.raises(InputError) as error:
         import_robot(path)
     assert str(error.value).startswith(f"{path}: {expected}")
+
+
+def test_welded_boxes_have_names_of_their_own(tmp_path):
+    """Also where a hinge has the name that they would be given: nothing replaces anything."""
+    plain_robot = import_robot(write(tmp_path, URDF, "robot.urdf"))
+    clash = import_robot(write(tmp_path, URDF.replace('"other"', '"hip_1"'), "clash.urdf"))
+    for found in (plain_robot, clash):
+        assert found.morphology.num_hinges == 2
+        assert found.morphology.mass == pytest.approx(0.65)
+
+
+def test_what_is_changed_is_named(tmp_path):
+    text = URDF.replace('izz="6e-4"', 'izz="60e-4"').replace(
+        '<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><dynamics damping="0.1"/>'
+    )
+    found = import_robot(write(tmp_path, text, "robot.urdf")).missing
+    assert "base: an inertia that no body has; the nearest one is taken" in found
+    assert "hip: damping and friction; here those of our servos" in found
+    damped = (
+        MJCF.replace('name="knee"', 'name="knee" damping="1" armature="1e-3"')
+        .replace('type="ellipsoid"', 'type="ellipsoid" material="red"')
+        .replace("<worldbody>", '<asset><material name="red" rgba="1 0 0 1"/></asset><worldbody>')
+    )
+    robot = import_robot(write(tmp_path, damped, "robot.xml"))
+    assert {"damping of joints", "armatures"} <= {*robot.missing}
+    assert "red: 1.0, green: 0.0, blue: 0.0" in dump_yaml(robot.files[0], default_flow_style=None)
+
+
+def test_a_chain_too_long_to_be_read_again_is_refused(tmp_path):
+    link = '<link name="l{0}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" '
+    link += 'ixz="0" iyz="0"/></inertial></link>'
+    joint = '<joint name="j{0}" type="continuous"><parent link="l{1}"/><child link="l{0}"/></joint>'
+    text = "".join(link.format(k) for k in range(120))
+    text += "".join(joint.format(k, k - 1) for k in range(1, 120))
+    path = write(tmp_path, f"<robot name='long'>{text}</robot>", "long.urdf")
+    with pytest.raises(InputError, match=r"long\.urdf: expected at most 200 levels of nesting"):
+        import_robot(path)
+
+
+def test_mirrored_meshes_have_their_volumes(tmp_path):
+    mesh = '<mesh filename="ball.stl" scale="1 -1 1"/>'
+    path = write(tmp_path, URDF.replace('<sphere radius="0.03"/>', mesh), "robot.urdf")
+    ball = trimesh.creation.icosphere(radius=0.03)
+    ball.export(tmp_path / "ball.stl")
+    found = import_robot(path)
+    assert found.modules["base_1"].volume == pytest.approx(ball.volume, rel=1e-5)
+    assert not any("holes" in words for words in found.missing)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"solid x\nendsolid x\n", b"solid x\nfacet nor", b"\0" * 84]
+)
+@pytest.mark.parametrize("ending", ["stl", "obj", "ply", "3mf"])
+def test_meshes_that_cannot_be_read_are_named(content, ending, tmp_path):
+    mesh = f'<mesh filename="ball.{ending}"/>'
+    path = write(tmp_path, URDF.replace('<sphere radius="0.03"/>', mesh), "robot.urdf")
+    (tmp_path / f"ball.{ending}").write_bytes(content)
+    assert f"base: the mesh ball.{ending}, which cannot be read" in import_robot(path).missing
 
 
 def test_meshes_that_are_missing_or_open_are_named(tmp_path):

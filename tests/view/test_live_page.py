@@ -7,6 +7,7 @@ import json
 import signal
 import socket
 import threading
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,7 +23,7 @@ from mjx_revolve.view.live.commands import Current, Drop, Pause, Rate
 from mjx_revolve.view.live.page import live_page
 from mjx_revolve.view.live.robot_catalogue import load_catalogue
 from mjx_revolve.view.live.server import LiveServer
-from mjx_revolve.view.live.simulation import CatalogueEntry, LiveSimulation
+from mjx_revolve.view.live.simulation import SLICE, CatalogueEntry, LiveSimulation
 from mjx_revolve.water.world import load_world
 from standin import SPEED, StandIn
 
@@ -114,6 +115,20 @@ def test_time_stops_and_goes_on(entries):
         running.ask(Pause(False))
         assert running.hear("poses", lambda data: data["t"][0] > stopped)
         assert running.hear("state", lambda data: not data["paused"])["rate"] == 4
+
+
+def test_a_world_slower_than_its_pace_listens(entries):
+    with Running(entries) as running:
+        running.hear("poses")
+        advance = running.tank.advance
+
+        def slowly(*given):
+            time.sleep(1.5 * SLICE)
+            return advance(*given)
+
+        running.tank.advance = slowly
+        running.ask(Pause(True))
+        assert running.simulation.paused
 
 
 def test_who_blows_up_is_taken_out(entries):

@@ -221,7 +221,8 @@ class LiveSimulation:
         while not self.ended:
             now = time.monotonic()
             resting = self.paused or not self._listeners
-            if resting or due > now:
+            # A world that is slower than its pace listens, too.
+            if resting or due > now or not self._commands.empty():
                 self._answer(_IDLE_INTERVAL if resting else due - now)
                 if resting:
                     due = last = time.monotonic()
