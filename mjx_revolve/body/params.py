@@ -225,7 +225,12 @@ def multiply_factors(one: object, other: object) -> Any:
 
 def _change_thruster(thruster: Thruster, params: Mapping[str, Any]) -> Thruster:
     """The thruster with its own numbers, then its curve scaled to a thrust [N]."""
-    thruster = replace(thruster, **params.get("thruster", {}))
+    own = params.get("thruster", {})
+    if own.get("curve", thruster.curve) != thruster.curve:  # another one has numbers of its own
+        kept = ("axis", "position", "range", "time_constant", "torque_ratio")
+        thruster = Thruster(**{name: getattr(thruster, name) for name in kept} | own)
+    else:
+        thruster = replace(thruster, **own)
     if "thrust" not in params:
         return thruster
     ahead = thruster.range[1]

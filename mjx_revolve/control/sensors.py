@@ -34,6 +34,8 @@ DEFAULT_SENSORS = tuple(Sensor(type=name) for name in ("tilt", "gyro", "angle", 
 # A sample counts as due from this share of a period before its time: more than the rounding error
 # of a float32 clock.
 _DUE = 0.01
+# Share of a count that the last bits of a float32 clock, and of its product, may lack.
+_ROUNDING = 1.5e-7
 # The most samples that a delay may keep; a choice.
 _MAX_KEPT = 256
 
@@ -45,7 +47,8 @@ def count_samples(time: Scalar, rate: float) -> jax.Array:
         time: since the first [s].
         rate: of samples [Hz].
     """
-    return jnp.floor(time * rate + _DUE)
+    count = time * rate
+    return jnp.floor(count + _DUE + _ROUNDING * count)
 
 
 class Observation(NamedTuple):

@@ -72,8 +72,8 @@ def _step(
 ) -> StepOutput:
     """The step of a `Controller` made of sines."""
     sizes, offset, rate, center = parameters
-    fade, wave = fade_in(time), offset
+    fade, wave = fade_in(time), center + offset
     for k, (u, v) in enumerate(sizes):
         sine, cosine = sincos((k + 1) * rate * time)
         wave = wave + u * sine + v * cosine
-    return state, center + fade * wave
+    return state, fade * wave

@@ -299,8 +299,8 @@ def fit_capacity(
     sizes = _sizes(assembly, columns)
     if modules and drags_whole_bodies(world.drag):  # no part may overflow
         sizes = _widest_bodies(assembly, columns, sizes, modules)
-    types = {m.kind.name: m.kind for r in robots for m in r.morphology.modules}
-    types |= {kind.name: kind for kind in kinds}
+    # Of one name there may be several, with params of their own.
+    types = {id(k): k for k in (*(m.kind for r in robots for m in r.morphology.modules), *kinds)}
     # Nothing acts on what neither floats nor drags nor carries nor pushes.
     every = [x for x in columns.laws if not x.idle or carries or world.self_contact]
     near = contact and world.bed is not None

@@ -7,18 +7,20 @@ own has the world's.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from mjx_revolve.body.exposure import exposure
 from mjx_revolve.body.module_types import Part
 from mjx_revolve.body.placement import RestPose
 from mjx_revolve.inputs.short_repr import short_repr
 from mjx_revolve.water.added_mass import box_added_mass, entrained_water
+from mjx_revolve.water.buoyancy import find_buoyancy_law
 from mjx_revolve.water.cross_flow import CROSS_FLOW
 from mjx_revolve.water.drag import DRAG_LAWS
 from mjx_revolve.water.face_drag import beside, split_axes
@@ -69,6 +71,7 @@ class FluidTable:
         entrained: share of `carried_mass` that is entrained water [-].
         coupling: what a stated added mass has beside its diagonal: along the axes, then about them,
             per unit density, part frame [m³, m⁴, m⁵].
+        stated: whether a part states its added mass.
     """
 
     __repr__ = short_repr
@@ -97,12 +100,20 @@ class FluidTable:
     carried_inertia: Float[np.ndarray, "npart 3"]
     entrained: Float[np.ndarray, "npart 3"]
     coupling: Float[np.ndarray, "npart 6 6"]
+    stated: Bool[np.ndarray, " npart"]
 
     @property
     def face_area(self) -> Float[np.ndarray, "npart 3"]:
         """What the water reaches of a face across each axis [m²]."""
         area: np.ndarray = self.exposed * self.silhouette
         return area
+
+    @property
+    def lifted(self) -> Float[np.ndarray, " npart"]:
+        """Volume of what the water lifts of each part [m³]."""
+        lifts = [find_buoyancy_law(name).lifts for name in self.buoyancy]
+        volume: np.ndarray = self.volume * np.array(lifts, float)
+        return volume
 
     @property
     def coupled(self) -> np.ndarray:
@@ -141,7 +152,10 @@ def _scaled(parameters: Any, part: Part) -> Any:
     own = {k.partition(".")[2]: f for k, f in part.factors if k.startswith(f"{law}.")}
     if not own:
         return parameters
-    return replace(parameters, **{name: getattr(parameters, name) * f for name, f in own.items()})
+    changed = {name: getattr(parameters, name) * f for name, f in own.items()}
+    if "alpha_stall" in changed:  # beyond a right angle nothing stalls
+        changed["alpha_stall"] = min(changed["alpha_stall"], math.pi / 2)
+    return replace(parameters, **changed)
 
 
 def make_fluid_table(
@@ -210,7 +224,7 @@ def make_fluid_table(
         np.where(replaced[:, None], 0.0, x) for x in (added_mass, added_inertia)
     )
     drag = each([drag_law(p, world) for p in parts])
-    if replaced.any():
+    if replaced.any() and world.drag != ELLIPSOID.name:  # MuJoCo's laws are for all parts
         drag = tuple("off" if r else name for r, name in zip(replaced, drag, strict=True))
     own = (world.added_mass & ~(stated | replaced))[:, None]  # what fills the room is ours
     off = world.buoyancy == "off"
@@ -250,4 +264,5 @@ def make_fluid_table(
         carried_inertia=on[kind] * added_inertia + own * more * inside[1][kind],
         entrained=flooded / np.where(carried_mass > 0, carried_mass, 1),
         coupling=on[kind][:, None] * (known - diagonal[:, None] * np.eye(6)),
+        stated=stated,
     )

@@ -94,7 +94,7 @@ def external_force(tree: Tree, state: State, water: Water, thrusts: Any) -> tupl
         (force of the bed, force of the water), world frame, three of `[lanes]` each [N].
     """
     root, moved = _in_current(tree, state, water)
-    world = tree.world
+    world, still = tree.world, _without_gust(water)
 
     def forces(
         level: Level, children: Any, moved: tuple[BodyMotion, Any], *submerged: Any
@@ -105,7 +105,7 @@ def external_force(tree: Tree, state: State, water: Water, thrusts: Any) -> tupl
         external = water_forces(world, level, motion, gravity, water, thrusts, before)
         bed: Vec = _ZERO
         if level.points is not None:
-            bed = bed_forces(world, level, motion, level.points, water)[1]
+            bed = bed_forces(world, level, motion, level.points, still)[1]
         wide = lambda x: add(x, jnp.zeros_like(motion.height))  # noqa: E731
         turned = tuple(
             tuple(wide(dot(axis, force)) for axis in motion.axes) for force in (bed, external.force)
@@ -140,13 +140,14 @@ def contact_force(
     if not (tree.touches or wrench or len(pressed)):
         return jnp.zeros((1 + count, *like.shape), like.dtype)
     root, moved = _in_current(tree, state, water)
+    still = _without_gust(water)
 
     def forces(level: Level, children: Any, moved: tuple[BodyMotion, Any], *xs: Any) -> Any:
         given, size = list(xs), jnp.zeros((level.count, *like.shape), like.dtype)
         push = given.pop(0)[1] if wrench else _ZERO
         press = add(given.pop() if given else 0.0, children[3] if children else 0.0)
         if level.points is not None:
-            push = vadd(push, bed_forces(tree.world, level, moved[0], level.points, water)[1])
+            push = vadd(push, bed_forces(tree.world, level, moved[0], level.points, still)[1])
         push = vadd(push, children[:3]) if children else push
         force = safe_norm(tuple(add(x, size) for x in push)) + press
         # An overflow row of `BatchedTrees` is part of the body that it is fixed to.
@@ -160,6 +161,11 @@ def contact_force(
     children, below, _ = tree.backward_pass(forces, start, moved, *wrench[1:], *rows)
     core = forces(tree.root, children, (root, None), *wrench[:1], *([pressed[:1]] if rows else []))
     return jnp.concatenate([core[1], tree.join_rows(below, like)])
+
+
+def _without_gust(water: Water) -> Water:
+    """Water for the bed's force as it is, without what the step foresees of a gust."""
+    return water._replace(acceleration=_ZERO)
 
 
 def contact_by_half(

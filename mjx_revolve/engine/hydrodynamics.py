@@ -51,7 +51,6 @@ from mjx_revolve.water.buoyancy import displaced_water, find_buoyancy_law, surfa
 from mjx_revolve.water.drag import find_drag_law
 from mjx_revolve.water.face_drag import quadratic_drag
 from mjx_revolve.water.flow import Water, flow, is_uniform, surface, wave_convection
-from mjx_revolve.water.fossen import FOSSEN
 from mjx_revolve.water.laws import NO_DRAG, BodyDragLaw, PartDragLaw, PartFlow
 from mjx_revolve.water.near_surface import NearSurface, near_surface, turning_share
 from mjx_revolve.water.world import World
@@ -268,8 +267,7 @@ def _near_surface(world: World, parts: Parts, at: _Immersion, wide: Sum) -> Near
     That is so of stated water, and where there is no surface that presses.
     """
     law = find_buoyancy_law(parts.laws.buoyancy)
-    stated = parts.laws.coupled or parts.laws.drag == FOSSEN.name
-    if not world.near_surface or parts.carried is None or stated or not law.lifts:
+    if not (world.near_surface and law.lifts) or parts.carried is None or parts.laws.stated:
         return None
     up = tuple(map(wide, at.up))
     return near_surface(

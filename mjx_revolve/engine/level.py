@@ -60,12 +60,14 @@ class PartLaws(NamedTuple):
         drag: name of the drag law.
         pushes: whether they are thrusters.
         coupled: whether they may carry more water than a diagonal in their axes, as stated.
+        stated: whether they state the water that they carry.
     """
 
     buoyancy: str
     drag: str
     pushes: bool = False
     coupled: bool = False
+    stated: bool = False
 
     @property
     def idle(self) -> bool:

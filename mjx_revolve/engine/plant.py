@@ -76,7 +76,7 @@ def body_geometries(assembly: Assembly) -> BodyGeometry:
     lever = _buoyancy_center(assembly) - heavy
     arm = np.linalg.norm(lever, axis=1, keepdims=True)
     hangs = arm > _ONE_POINT
-    displaced = world.density * np.bincount(layout.body, table.volume)
+    displaced = world.density * np.bincount(layout.body, table.lifted)
     thrust = [p.thruster.largest_thrust if p.thruster else 0.0 for p in assembly.thruster_part]
     return BodyGeometry(
         length=extent.max(1),
@@ -135,10 +135,10 @@ def _mass_center(assembly: Assembly) -> np.ndarray:
 
 
 def _buoyancy_center(assembly: Assembly) -> np.ndarray:
-    """`[robots, 3]` centres of what the parts displace at rest, core frame [m]."""
+    """`[robots, 3]` centres of what lifts the parts at rest, core frame [m]."""
     layout, table = assembly.layout, assembly.fluid
     place = layout.position + turned(layout.rotation, table.center_of_volume)
-    return _mean(place, table.volume, layout.body, len(assembly.morphologies))
+    return _mean(place, table.lifted, layout.body, len(assembly.morphologies))
 
 
 def _mean(place: np.ndarray, weight: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:

@@ -158,8 +158,8 @@ def read_constants(assembly: Assembly, pairs: np.ndarray = _NO_PAIRS) -> StepCon
         )
     pushing = np.zeros(len(table.volume), bool)
     pushing[assembly.thruster_row] = True
-    columns = table.buoyancy, table.drag, pushing.tolist(), table.coupled.tolist()
-    each = list(zip(*columns, strict=True))
+    marks = pushing, table.coupled, table.stated
+    each = list(zip(table.buoyancy, table.drag, *(x.tolist() for x in marks), strict=True))
     laws = sorted(set(each))
     number = {law: k for k, law in enumerate(laws)}
     drags = {name: find_drag_law(name) for name in sorted({*table.drag})}
@@ -185,8 +185,7 @@ def read_constants(assembly: Assembly, pairs: np.ndarray = _NO_PAIRS) -> StepCon
 def _falls(assembly: Assembly) -> np.ndarray:
     """`[nbody]` acceleration at which each body, or its whole robot, would begin to sink [m/s²]."""
     table, world = assembly.fluid, assembly.world
-    lifts = np.array([find_buoyancy_law(law).lifts for law in table.buoyancy], bool)
-    lifted = np.bincount(table.body, world.density * table.volume * lifts, len(assembly.mass))
+    lifted = np.bincount(table.body, world.density * table.lifted, len(assembly.mass))
     fallen = []
     for owner in (np.arange(len(assembly.mass)), assembly.robot + 1):
         mass, lift = (np.bincount(owner, x) for x in (assembly.mass, lifted))
@@ -365,12 +364,15 @@ def _read_bounds(
     table, density, mass = assembly.fluid, assembly.world.density, assembly.mass
     x, y, z = 2 * table.half_size.T
     face, steep = np.max([x * y, y * z, z * x], 0), np.empty(len(x))
+    # What modules state, twice: across a body two faces meet the flow.
+    stated = np.broadcast_to(table.coefficients["drag_coefficient"].T, (3, len(x))).max(0)
+    stated = 2 * stated * table.factors.get("drag", 1.0)
     for name, law in laws.items():
         bound = None if law.explicit else law.steepest
         if callable(bound):
-            found = density * bound(numbers[name])
+            found = getattr(numbers[name], "density", density) * bound(numbers[name])
         else:
-            found = (_UNBOUNDED if bound is None else bound) * density * face
+            found = np.maximum(_UNBOUNDED if bound is None else bound, stated) * density * face
         steep = np.where(np.array(table.drag) == name, found, steep)
     if table.carries:
         least, across = density * table.carried_mass.min(-1), table.half_size.argmin(-1)

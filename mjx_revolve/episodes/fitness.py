@@ -602,14 +602,13 @@ def make_mixed_fitness(
         raise InputError("examples: expected at least one morphology; found none")
     figures = [body_geometry(robot) for robot in robots]
     if modules:  # no body is longer than this, and one sinks only if one of its types does
-        types = {m.kind.name: m.kind for robot in robots for m in robot.morphology.modules}
-        types |= {kind.name: kind for kind in kinds}
-        longest = modules * max(_diagonal(kind) for kind in types.values())
-        heavy = any(world.density * kind.volume < kind.mass / 2 for kind in types.values())
+        types = [*(m.kind for robot in robots for m in robot.morphology.modules), *kinds]
+        longest = modules * max(map(_diagonal, types))
+        heavy = any(world.density * kind.volume < kind.mass / 2 for kind in types)
         sinks = world.buoyancy == "off" or (heavy and config.trim != "neutral")
         thrust = modules * max(
             sum(p.thruster.largest_thrust for p in kind.parts if p.thruster is not None)
-            for kind in types.values()
+            for kind in types
         )
         figures.append(figures[0]._replace(length=longest, sinks=sinks, thrust=thrust))
     reach = max(max_distance(config.task, world, figure) for figure in figures)

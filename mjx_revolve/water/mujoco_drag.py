@@ -182,17 +182,17 @@ def ellipsoid(v: Vec, w: Vec, k: EllipsoidNumbers, carried: bool) -> tuple[Vec, 
     Returns:
         Force [N] and torque [N·m], geom frame, at the centre.
     """
-    tiny = 1e-30
     squares = [x * x for x in v]
     num = total(*[mul(a, x) for a, x in zip(k.areas, squares, strict=True)])
     den = total(*[mul(a * a, x) for a, x in zip(k.areas, squares, strict=True)])
     speed = safe_norm(v)
     moving = speed > 0
     # The area that faces the flow, over the largest.
-    facing = jnp.sqrt(jnp.where(moving, den / jnp.maximum(num, tiny), 1.0))
+    above, below = jnp.where(moving, den, 1.0), jnp.where(moving, num, 1.0)
+    facing = jnp.sqrt(above / below)
     # As MuJoCo has it: the denominator is the normal's length squared, which scales `normal` below.
     normal = tuple(mul(a, x) for a, x in zip(k.areas, v, strict=True))
-    cosine = jnp.where(moving, num / jnp.maximum(speed * den, tiny), 0.0)
+    cosine = jnp.where(moving, num / (jnp.where(moving, speed, 1.0) * above), 0.0)
     # (n × v) × v = (n · v) v - (v · v) n
     square = total(*squares)
     across = tuple(num * x - square * n for x, n in zip(v, normal, strict=True))

@@ -220,12 +220,18 @@ def test_touch_is_the_beds_force_on_each_body(robot):
     with jax.enable_x64(True):
         engine = make_engine(robot)
 
-        def push(qpos, qvel):
+        def push(qpos, qvel, gust):
             state = engine.init(qpos, qvel)
+            water = water_of(TANK)._replace(acceleration=(gust, 0.0, 0.0))
             return engine.external_force(
-                state, engine.plant.arrange(jnp.zeros(ctrl.shape)), water_of(TANK)
-            )
+                state, engine.plant.arrange(jnp.zeros(ctrl.shape)), water
+            ), engine.contact_force(state, water)
 
-        bed, _ = jax.jit(push, compiler_options=QUICK)(jnp.asarray(qpos), jnp.asarray(qvel))
+        push = jax.jit(push, compiler_options=QUICK)
+        (bed, _), felt = push(jnp.asarray(qpos), jnp.asarray(qvel), 0.0)
+        # What the step foresees of a gust is no force.
+        (same, _), again = push(jnp.asarray(qpos), jnp.asarray(qvel), 0.3)
+        np.testing.assert_array_equal(same, bed)
+        np.testing.assert_array_equal(again, felt)
     # Nothing moves, so that no force has friction: all of them point up.
     assert found.touch.sum(0) == pytest.approx(np.asarray(bed[2]), rel=1e-9)

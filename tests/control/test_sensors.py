@@ -9,7 +9,7 @@ from laboratory import OAR, ROOT, check_refused, read
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.body.sensors import SENSORS, Sensor, SensorRow
 from mjx_revolve.control.readings import SensorReadings
-from mjx_revolve.control.sensors import make_observer
+from mjx_revolve.control.sensors import count_samples, make_observer
 from mjx_revolve.inputs import schema
 from mjx_revolve.inputs.errors import InputError
 
@@ -59,6 +59,16 @@ def test_a_rate_samples_and_holds():
     # Faster than the steps is at each step.
     found = watch(Sensor(type="climb", rate=1000.0), ramp(5, 0.01))
     assert found[:, 0] == pytest.approx(0.01 * np.arange(5))
+
+
+@pytest.mark.parametrize(("dt", "duration"), [(0.005, 7200), (0.01, 7200), (0.02, 14400)])
+def test_no_sample_is_missed_however_long_it_lasts(dt, duration):
+    """By a float32 clock, at the rate of the steps and at 20 Hz, in the last minute."""
+    steps = np.arange(round((duration - 60) / dt), round(duration / dt))
+    for every in (1, round(0.05 / dt)):
+        time = jnp.asarray(steps, jnp.float32) * jnp.float32(dt)
+        found = count_samples(time, 1 / (every * dt))
+        assert (np.diff(np.asarray(found)[::every]) == 1).all()
 
 
 def test_a_delay_gives_what_was():

@@ -66,6 +66,15 @@ def test_a_stretched_body_is_as_long_as_the_way_through_it():
     assert geometry.stretched > 1.2 * geometry.length
 
 
+def test_what_the_water_does_not_lift_rights_nothing():
+    """A light brick that floods hangs below the core, however much it displaces."""
+    brick = "{type: FixedBrick, params: {volume: 4.0e-5%s}}"
+    core = "body: {type: Core, params: {electronics_volume: 1.0e-4}, children: {1: %s}}"
+    for law, side in (("", 1.0), (", buoyancy: 'off'", -1.0)):
+        robot = build_robot(read(core % (brick % law)), world(**WATER))
+        assert body_geometry(robot).up == pytest.approx([0.0, side, 0.0]), law
+
+
 def reaches(robot):
     """How far each arm reaches from the core's centre."""
     layout, moved = robot.assembly.layout, robot.assembly.moved

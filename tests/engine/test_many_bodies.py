@@ -463,6 +463,23 @@ def test_constants_follow_from_the_types_of_modules_not_from_examples():
     pack_bodies([build_robot(random_body(seed, 5, 6), tank) for seed in range(12)], roomy)
 
 
+def test_modules_of_one_type_may_have_params_of_their_own():
+    two = read("""
+body:
+  type: Core
+  children:
+    0: {id: slow, type: ActiveHinge, params: {factors: {servo_speed: 0.9}}}
+    1: {id: fast, type: ActiveHinge}
+    2: {id: jet, type: Thruster, params: {thruster: {
+      curve: interpolated, commands: [-1, 0, 1], thrusts: [-1, 0, 2]}}}
+    3: {id: plain, type: Thruster}
+""")
+    robot = build_robot(two, world(**WATER))
+    capacity = fit_capacity([robot])
+    assert capacity.curve_points == 3
+    pack_bodies([robot], capacity)
+
+
 def test_a_number_that_is_the_same_in_all_bodies_of_the_types_must_stay_so():
     """Say, hinges of other friction."""
     tank = world(**WATER)

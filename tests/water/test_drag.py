@@ -1,6 +1,7 @@
 """Drag: falls and coasts in closed form, MuJoCo's own laws, Gazebo's plate, no free energy."""
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -16,7 +17,12 @@ from laboratory import (
     world,
 )
 from mjx_revolve.water.face_drag import face_drag_coefficients
-from mjx_revolve.water.mujoco_drag import inertia_box
+from mjx_revolve.water.mujoco_drag import (
+    EllipsoidNumbers,
+    ellipsoid,
+    ellipsoid_numbers,
+    inertia_box,
+)
 
 RHO = 999.1026
 G = 9.81
@@ -118,3 +124,14 @@ def test_a_body_that_displaces_nothing_has_the_inertia_boxs_drag():
     own = mass / 12 * (np.sum(size**2) - size**2)
     turning = np.array(torque)[:, None] * share - np.cross(0.5 * np.ones(3), 0.5 * own)[:, None]
     assert found[3:] == pytest.approx(turning / own[:, None], rel=1e-9)
+
+
+def test_the_ellipsoids_gradient_is_finite_at_rest():
+    numbers = ellipsoid_numbers(
+        np.array([0.1, 0.05, 0.03]), np.array([1, 0.5, 0.25, 1.5, 1, 1] + 6 * [0.1]), RHO, 1e-3
+    )
+    rows = {name: np.float32(x) for name, x in vars(numbers).items()}
+    numbers = EllipsoidNumbers(**{k: tuple(x) if np.ndim(x) else x for k, x in rows.items()})
+    still = (jnp.zeros(()),) * 3
+    found = jax.jacobian(lambda v, w: ellipsoid(v, w, numbers, True), (0, 1))(still, still)
+    assert np.isfinite(np.array(jax.tree.leaves(found))).all()

@@ -115,6 +115,13 @@ def test_coefficients_may_differ_from_axis_to_axis():
     area = np.prod(SIZE) / np.array(SIZE)
     expected = 0.5 * still.density * np.array([1, 2, 3]) * area * 0.25
     assert np.diag(push) == pytest.approx(expected, rel=1e-9)
+    # However large they are, and with factors, what drags only brakes.
+    for drag, tank in ((40.0, world(**WATER)), (8.0, world(drag="faces"))):
+        braked = box_robot(SIZE, MASS, tank, drag_coefficient=drag, factors=(("drag", 5.0),))
+        qpos, qvel = at_rest(braked, 3, -5.0)
+        qvel[:3] = 0.8 * np.eye(3)
+        after = march(braked, 0.1, qpos, qvel)[2][:, :3]
+        assert (np.diff(np.linalg.norm(after, axis=1), axis=0) < 0).all()
     # Params take them, too; one number is three of the same, bit for bit.
     same = box_robot(SIZE, MASS, still, drag_coefficient=(1.7,) * 3)
     turned = moving(same)
@@ -126,11 +133,23 @@ def test_coefficients_may_differ_from_axis_to_axis():
     assert given.modules[0].kind.parts[0].drag_coefficient == (1.0, 2.0, 3.0)
 
 
+def test_near_the_surface_stated_water_keeps_its_submerged_share_under_any_drag_law():
+    tank = world(gravity=9.81, buoyancy="partial", near_surface=True, **WATER)
+    found = []
+    for law in (None, "faces"):
+        robot = box_robot(SIZE, MASS, tank, fossen=Fossen(added_mass=[1.0] * 6), drag=law)
+        qpos, qvel = at_rest(robot, 1, -0.03)
+        qvel[0] = 1e-9
+        found.append(accelerate(robot, qpos, qvel))
+    assert found[0] == pytest.approx(found[1], abs=1e-6)
+
+
 def test_where_they_may_stand():
     whole = "body: {type: Core, params: {fossen: {whole: true}}, children: {1: {type: %s}}}"
     body = read(whole % "FixedBrick")
     robot = build_robot(body, world(**WATER))
     assert robot.fluid.drag == ("fossen", "off") and not robot.fluid.carries
+    assert set(build_robot(body, world(drag="ellipsoid")).fluid.drag) == {"ellipsoid"}
     with pytest.raises(InputError, match=r"expected no hinges, as the core's fossen\.whole"):
         read(whole % "ActiveHinge")
     brick = "body: {type: Core, children: {1: {type: %s, params: {fossen: {%s}}}}}"
