@@ -336,9 +336,7 @@ def _scores(
     def spec(seconds: float) -> Fitness:
         changes = {"duration": seconds, "trials": _STARTS, "robust": None}
         horizon = fitness.settings.horizon
-        if (
-            horizon is not None and seconds >= horizon
-        ):  # the way itself: nothing is left to foretell
+        if horizon is not None and seconds >= horizon:  # nothing is left to foretell
             changes["horizon"] = None
         task = fitness.settings.model_copy(update=changes)
         return replace(fitness, config=fitness.config.model_copy(update={"task": task}))
