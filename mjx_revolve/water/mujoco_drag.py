@@ -186,7 +186,8 @@ def ellipsoid(v: Vec, w: Vec, k: EllipsoidNumbers, carried: bool) -> tuple[Vec, 
     num = total(*[mul(a, x) for a, x in zip(k.areas, squares, strict=True)])
     den = total(*[mul(a * a, x) for a, x in zip(k.areas, squares, strict=True)])
     speed = safe_norm(v)
-    moving = speed > 0
+    # So fast that the quotients below have finite gradients: some nm/s in float32.
+    moving = den > np.finfo(speed.dtype).tiny ** 0.45
     # The area that faces the flow, over the largest.
     above, below = jnp.where(moving, den, 1.0), jnp.where(moving, num, 1.0)
     facing = jnp.sqrt(above / below)
