@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from experiments.common import ROOT, make_folder, make_parser, write_results
+from experiments.common import ROOT, check_whole, make_folder, make_parser, write_results
 from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command, whole
 from mjx_revolve.inputs.errors import InputError
@@ -520,6 +520,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--json", metavar="FILE", help="where to (default: bench.json in --out)")
     options = parser.parse_args(argv)
+    check_whole(parser, options, "quick", "only")
     groups = [QUICK] if options.quick else [PARTS] if options.parts else list(GROUPS)
     if options.only:
         groups = [group for group in groups if options.only in group.name]
@@ -533,7 +534,8 @@ def main(argv: list[str] | None = None) -> int:
     versions = machine["versions"]
     print(
         f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_bytes'] / 2**30:.0f} GiB; "
-        f"jax {versions['jax']}, mujoco {versions['mujoco']}, mujoco-mjx {versions['mujoco-mjx']}; "
+        f"jax {versions['jax']}, mujoco {versions['mujoco']}, "
+        f"mujoco-mjx {versions.get('mujoco-mjx', 'none')}; "
         f"{options.threads} threads of MuJoCo C; load average before {before:.1f}"
     )
     report: dict[str, Any] = {

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import datetime
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -37,6 +39,20 @@ def make_parser(name: str, description: str) -> Parser:
     add("--out", metavar="DIR", help=f"folder to write into (default: runs/{name})")
     add("--results", action="store_true", help="write docs/results as well, which pages show")
     return parser
+
+
+def check_whole(parser: Parser, options: argparse.Namespace, *names: str) -> None:
+    """Raises `InputError` if `--results` would replace what pages show by a part of it.
+
+    Args:
+        parser: of the options.
+        options: as given.
+        names: of options that leave something out.
+    """
+    for name in names:
+        if options.results and getattr(options, name) != parser.get_default(name):
+            option = name.replace("_", "-")
+            raise InputError(f"--results: expected all of the study; found --{option}")
 
 
 def make_folder(out: str | None, name: str) -> Path:
@@ -83,6 +99,16 @@ def read_rows(name: str, rows: str, folder: Path = RESULTS) -> list[dict[str, An
     return json.loads(path.read_text("utf-8"))["numbers"][rows] if path.exists() else []
 
 
+def _study_hash() -> str:
+    """A hash of what studies run besides the package: experiments, configurations and robots."""
+    found = hashlib.sha256()
+    for folder in ("experiments", "configs", "morphologies"):
+        for path in sorted((ROOT / folder).iterdir()):
+            if path.suffix in (".py", ".yaml"):
+                found.update(path.read_bytes())
+    return found.hexdigest()[:12]
+
+
 def write_results(
     name: str, numbers: Mapping[str, Any], seeds: Sequence[int], folder: Path | None = None
 ) -> Path:
@@ -104,7 +130,7 @@ def write_results(
     result = {
         "study": name,
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "versions": known["versions"] | {"source": source_hash()},
+        "versions": known["versions"] | {"source": source_hash(), "study": _study_hash()},
         "machine": {key: known[key] for key in ("cpu", "cpu_count", "device")},
         "seeds": list(seeds),
         "numbers": numbers,

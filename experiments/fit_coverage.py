@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common import make_folder, make_parser, write_results
+from experiments.common import check_whole, make_folder, make_parser, write_results
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.fitting.parameters import read_free, split_free
@@ -128,6 +128,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--cases", type=whole(0), default=100)
     parser.add_argument("--robots", default=",".join(FREE))
     arguments: argparse.Namespace = parser.parse_args(argv)
+    check_whole(parser, arguments, "robots")
     runtime.prepare_process()
     folder = make_folder(arguments.out, "fit_coverage")
     results: dict[str, Any] = {}
@@ -135,12 +136,15 @@ def main(argv: list[str] | None = None) -> int:
     for name in arguments.robots.split(","):
         path = folder / f"{name}.jsonl"
         lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-        rows = [json.loads(line) for line in lines]
+        source = runtime.source_hash()
+        # What other code found is none of this study.
+        rows = [row for row in map(json.loads, lines) if row.get("source") == source]
+        rows = [row for row in rows if row["seed"] < arguments.cases]
         done = {row["seed"] for row in rows}
         for seed in range(arguments.cases):
             if seed in done:
                 continue
-            rows.append(_case(name, seed))
+            rows.append(_case(name, seed) | {"source": source})
             with path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(rows[-1]) + "\n")
             words = ", ".join(f"{v['name']} {v['value']:.4g} ({v['true']:.4g})"

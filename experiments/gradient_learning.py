@@ -116,7 +116,9 @@ def evolve(fitness: Fitness, seconds: float, seed: int, say: Callable[[str], Non
     strategy = make_strategy(EvolutionConfig(population_size=POPULATION), fitness.num_genes)
     key = jax.random.key(seed)
     state = strategy.init(key)
-    fitness(np.zeros((POPULATION, fitness.num_genes), np.float32), key)
+    # Compiled before the time counts, as what learns by gradients is.
+    population, thrown = strategy.ask(key, state)
+    strategy.tell(key, population, np.asarray(fitness(population, key)), thrown)
     start, number, spent, told = time.process_time(), 0, 0.0, 0.0
     while spent < seconds:
         own = jax.random.fold_in(key, number)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.common import make_folder, make_parser, write_results
+from experiments.common import check_whole, make_folder, make_parser, write_results
 from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.files import short_path, write_atomic
@@ -250,6 +250,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = make_parser("measured", "Our water beside what others have measured.")
     parser.add_argument("--quick", action="store_true", help="without the section in waves")
     options = parser.parse_args(argv)
+    check_whole(parser, options, "quick")
     folder = make_folder(options.out, "measured")
 
     from mjx_revolve.numerics.runtime import prepare_process

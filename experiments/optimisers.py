@@ -10,6 +10,7 @@ to call the function, not which optimiser is best.
 from __future__ import annotations
 
 import csv
+import importlib.util
 import sys
 import time
 import warnings
@@ -23,6 +24,7 @@ import numpy as np
 from experiments.common import ROOT, make_folder, make_parser, write_results
 from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command, whole
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import short_path
 
 SEED = 0
@@ -290,6 +292,8 @@ def main(argv: list[str] | None = None) -> int:
         help="leave out the step of gradient ascent, which takes most of a minute to compile",
     )  # fmt: skip
     options = parser.parse_args(argv)
+    if importlib.util.find_spec("cma") is None:
+        raise InputError("expected the package cma; found none (pip install 'mjx-revolve[cma]')")
     folder = make_folder(options.out, "optimisers")
 
     from mjx_revolve.numerics.runtime import prepare_process

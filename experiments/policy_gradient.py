@@ -263,10 +263,12 @@ def train(
 def judge(env: Any, policy: Callable[[np.ndarray], Any], seed: int) -> np.ndarray:
     """`[num_envs]` scores of one episode each, from other starts than those of learning."""
     now, _ = env.reset(seed=seed)
-    while True:
+    scores = np.full(env.num_envs, np.nan)
+    while np.isnan(scores).any():
         now, _, _, _, infos = env.step(policy(now))
-        if "score" in infos:
-            return infos["score"]
+        if "score" in infos:  # of those that are over, the first
+            scores = np.where(infos["_score"] & np.isnan(scores), infos["score"], scores)
+    return scores
 
 
 def time_both(env: Any, rounds: int = 8, steps: int = 100) -> tuple[float, float]:

@@ -31,6 +31,7 @@ from experiments.bench_cases import DEPTH, PHYSICS
 from experiments.common import (
     RESULTS,
     ROOT,
+    check_whole,
     make_folder,
     make_parser,
     read_rows,
@@ -579,6 +580,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--only", metavar="TEXT", help="cases whose name contains this")
     parser.add_argument("--rounds", type=whole(1), metavar="N", help="of timings (default: 3)")
     options = parser.parse_args(argv)
+    check_whole(parser, options, "quick")
     from mjx_revolve.numerics.runtime import prepare_process
 
     prepare_process()

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common import as_numbers, make_folder, write_results
-from experiments.studies import Case, given_settings, run_study, study_parser
+from experiments.common import as_numbers, check_whole, make_folder, write_results
+from experiments.studies import Case, check_finished, given_settings, run_study, study_parser
 from mjx_revolve.episodes.config import ControllerConfig, load_config
 from mjx_revolve.episodes.run_reader import RunReader
 from mjx_revolve.evolution.sweeps import Plan, make_plans
@@ -171,14 +171,17 @@ def main(argv: list[str] | None = None) -> int:
     """Runs the experiment."""
     argv = sys.argv[1:] if argv is None else argv
     words = "Evolves closed and open loops for the tasks that need senses, and compares them."
-    options = study_parser("senses", words, CONFIGS).parse_args(argv)
+    parser = study_parser("senses", words, CONFIGS)
+    options = parser.parse_args(argv)
+    check_whole(parser, options, "only")
     folder = make_folder(options.out, "senses").resolve()
     settings = given_settings(options)
     plans = {name: plan_config(folder, name, settings, options.seeds) for name in options.only}
-    if not options.report:
-        every = [plan for some in plans.values() for plan in some]
-        if code := run_study(every, "senses", argv, lambda start, champion: None):
-            return code
+    every = [plan for some in plans.values() for plan in some]
+    if options.report:
+        check_finished(every)
+    elif code := run_study(every, "senses", argv, lambda start, champion: None):
+        return code
     prepare_process()
     found = {}
     for name, some in plans.items():

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.common import make_folder, make_parser, write_results
+from experiments.common import check_whole, make_folder, make_parser, write_results
 from mjx_revolve.body.table import align
 from mjx_revolve.episodes.config import RobustConfig
 from mjx_revolve.inputs.commands import run_command
@@ -107,6 +107,8 @@ def read_champion(run: Path) -> Champion:
     config = load_config(run / "config.yaml")
     if config.bodies is not None or config.controller.type not in ("sine", "cpg"):
         raise InputError(f"{run}: expected one body with type: sine or cpg, which sense nothing")
+    if config.task.type != "directed_swim" or config.task.settle == 0:
+        raise InputError(f"{run}: expected task.type: directed_swim with a task.settle > 0")
     return Champion(config, load_genes(run / "champion" / "genes.yaml"))
 
 
@@ -428,6 +430,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--no-laws", action="store_true", help="leave out the table of the laws")
     options = parser.parse_args(argv)
+    check_whole(parser, options, "no_laws")
     champion = read_champion(Path(options.run))
     others = {"evolved with robust": options.robust} if options.robust else {}
     rivals = {name: read_champion(Path(run)) for name, run in others.items()}

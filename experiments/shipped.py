@@ -11,7 +11,6 @@ what the passport fails of each.
 from __future__ import annotations
 
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -49,23 +48,25 @@ def evolve(name: str, folder: Path, seed: int, cache: Path) -> dict[str, Any]:
     """
     shutil.rmtree(folder, ignore_errors=True)
     load, began = os.getloadavg()[0], time.monotonic()
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     command = [sys.executable, "-m", "mjx_revolve.evolve", name, "--out", str(folder)]
     command += ["--seed", str(seed)]
     place = {"JAX_COMPILATION_CACHE_DIR": str(cache)}
-    done = subprocess.run(command, cwd=ROOT, env=os.environ | place, stdout=subprocess.DEVNULL)
-    if done.returncode:
-        raise InputError(f"{name}: expected exit code 0 of evolve; found {done.returncode}")
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    with subprocess.Popen(
+        command, cwd=ROOT, env=os.environ | place, stdout=subprocess.DEVNULL
+    ) as process:
+        _, status, used = os.wait4(process.pid, 0)  # its own use, and its workers'
+        process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise InputError(f"{name}: expected exit code 0 of evolve; found {process.returncode}")
     reader = RunReader(folder)
     champion, metrics = reader.load_champion(), reader.load_metrics()
     passport = folder / "champion" / "passport.yaml"
     return {
         "wall_s": time.monotonic() - began,
-        "cpu_s": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
+        "cpu_s": used.ru_utime + used.ru_stime,
         "generations_s": float(metrics["seconds"][-1]),
         "evaluations": int(metrics["evaluations"][-1]),
-        "memory_bytes": 1024 * after.ru_maxrss,
+        "memory_bytes": 1024 * used.ru_maxrss,
         "load_average": [load, os.getloadavg()[0]],
         **{key: value for key, value in champion.facts.items() if not isinstance(value, str)},
         "passport": load_yaml(passport) if passport.is_file() else None,

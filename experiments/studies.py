@@ -22,7 +22,7 @@ from mjx_revolve.episodes.run_reader import RunReader
 from mjx_revolve.evolution.executor import make_executor
 from mjx_revolve.evolution.generations import Champion
 from mjx_revolve.evolution.run import Run
-from mjx_revolve.evolution.sweeps import Plan, choose_steps, run_plans
+from mjx_revolve.evolution.sweeps import Plan, choose_steps, next_step, run_plans
 from mjx_revolve.evolution.sweeps import make_plans as plan_runs
 from mjx_revolve.inputs.commands import Parser, whole
 from mjx_revolve.inputs.errors import InputError
@@ -106,7 +106,9 @@ def study_main(
     argv = sys.argv[1:] if argv is None else argv
     options = study_parser(name, description, make_cases(())).parse_args(argv)
     folder, plans = make_plans(make_cases(given_settings(options)), options, name)
-    if not options.report and (code := run_study(plans, name, argv)):
+    if options.report:
+        check_finished(plans)
+    elif code := run_study(plans, name, argv):
         return code
     outcomes = judge_champions(read_outcomes(plans, add))
     numbers = write_report(folder, outcomes)
@@ -114,8 +116,15 @@ def study_main(
         print(f"{run['name']}: {run['score']['text']} body lengths/s, {run['seeds']} seeds")
     print(f"{len(outcomes)} of {len(plans)} runs; written: {name}.csv in {short_path(folder)}")
     if options.results:
-        write_results(name, numbers, range(options.seeds))
+        write_results(name, numbers, sorted({one.plan.seed for one in outcomes}))
     return 0
+
+
+def check_finished(plans: Sequence[Plan]) -> None:
+    """Raises `InputError` for a finished run of another configuration or of fewer generations."""
+    for plan in plans:
+        if RunReader(plan.folder).is_finished and next_step(plan) != "finished":
+            raise InputError(f"{plan.name}: expected a run of all generations; found a shorter one")
 
 
 def given_settings(options: argparse.Namespace) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments.common import make_folder, make_parser, write_results
+from experiments.common import check_whole, make_folder, make_parser, write_results
 from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.files import short_path
@@ -55,6 +55,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = make_parser("validation", "The water's laws against closed forms.")
     parser.add_argument("--quick", action="store_true", help="only the cases that are quick")
     options = parser.parse_args(argv)
+    check_whole(parser, options, "quick")
     folder = make_folder(options.out, "validation")
 
     from mjx_revolve.numerics.runtime import prepare_process

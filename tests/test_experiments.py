@@ -13,6 +13,7 @@ from experiments import (
     optimisers,
     policy_gradient,
     precision,
+    senses,
     shipped,
     validation,
     validation_cases,
@@ -90,6 +91,12 @@ def test_on_the_simulators_clock_the_data_are_the_closed_form(readings):
         (bench.main, ["--rounds", "two"], "expected a whole number >= 1; found 'two'"),
         (gpu.main, ["--robot", "tiger"], "--robot: expected a shipped morphology; found 'tiger'"),
         (shipped.main, ["--only", "moon"], "--only: expected any of auv_escape, "),
+        (validation.main, ["--quick", "--results"], "--results: expected all of the study; found"),
+        (
+            senses.main,
+            ["--only", "lake_target", "--results"],
+            "expected all of the study; found --o",
+        ),
     ],
 )
 def test_bad_options_end_with_one_line_and_code_2(main, arguments, message, capsys):
