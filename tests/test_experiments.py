@@ -95,7 +95,7 @@ def test_on_the_simulators_clock_the_data_are_the_closed_form(readings):
         (
             senses.main,
             ["--only", "lake_target", "--results"],
-            "expected all of the study; found --o",
+            "--results: expected all",
         ),
     ],
 )
