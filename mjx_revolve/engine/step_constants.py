@@ -372,7 +372,8 @@ def _read_bounds(
         if callable(bound):
             found = getattr(numbers[name], "density", density) * bound(numbers[name])
         else:
-            found = np.maximum(_UNBOUNDED if bound is None else bound, stated) * density * face
+            most = _UNBOUNDED if bound is None else bound
+            found = np.maximum(most, stated if law.by_faces else 0.0) * density * face
         steep = np.where(np.array(table.drag) == name, found, steep)
     if table.carries:
         least, across = density * table.carried_mass.min(-1), table.half_size.argmin(-1)

@@ -221,8 +221,7 @@ def _module(
     body[:3, :3] = turn.T
     inertia = body @ link.inertia @ body.T
     if mass > 0:
-        center = inertia[:3, 3] / mass
-        square = inertia[:3, :3] / mass - np.outer(center, center)
+        square = _spread_of(inertia)[1]
         if np.linalg.eigvalsh(square)[0] < -1e-6 * abs(np.trace(square)):
             missing.append(f"{link.name}: an inertia that no body has; the nearest one is taken")
         parts += _with_mass(own, inertia, whole=not welded)
@@ -267,6 +266,12 @@ def _volumes(link: RigidLink, shapes: list[Shape]) -> tuple[np.ndarray, np.ndarr
     return center - middle, own * whole / own.sum()
 
 
+def _spread_of(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`[3]` centre [m] and `[3, 3]` mean square about it [m²] of a pseudo-inertia's mass."""
+    center = inertia[:3, 3] / inertia[3, 3]
+    return center, inertia[:3, :3] / inertia[3, 3] - np.outer(center, center)
+
+
 def _with_mass(own: list[dict[str, Any]], inertia: np.ndarray, whole: bool) -> list[dict[str, Any]]:
     """The boxes with the mass, module frame; where they do not have the inertia, four points."""
     mass = inertia[3, 3]
@@ -280,8 +285,7 @@ def _with_mass(own: list[dict[str, Any]], inertia: np.ndarray, whole: bool) -> l
         # Second moments are compared with the boxes', so that lengths count, not where zero is.
         if np.allclose(even, inertia, rtol=1e-6, atol=1e-9 * np.abs(inertia[:3, :3]).max()):
             return [part | {"mass": float(m)} for part, m in zip(own, masses, strict=True)]
-    center = inertia[:3, 3] / mass
-    square = inertia[:3, :3] / mass - np.outer(center, center)
+    center, square = _spread_of(inertia)
     width, axes = np.linalg.eigh(square - _SPECK**2 / 12 * np.eye(3))
     points = center + _CORNERS * np.sqrt(np.maximum(width, 0)) @ axes.T
     return [

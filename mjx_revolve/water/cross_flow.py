@@ -259,7 +259,8 @@ CROSS_FLOW = PartDragLaw(
     summary="drag across chains and rods, friction, wakes of chains' ends; elsewhere of faces",
     explicit=False,
     varied=True,
-    steepest=3.0,  # C_d of 1.75 across, and what modules state
+    steepest=3.0,  # C_d of 1.75 across
+    by_faces=True,
     coefficients=(
         Coefficient(
             "friction",

@@ -125,7 +125,8 @@ FACES = PartDragLaw(
     summary="quadratic drag on the true faces of the parts, and against their turning",
     explicit=False,
     varied=True,
-    steepest=3.0,  # C_d of 1.05, and what modules state
+    steepest=3.0,  # C_d of 1.05
+    by_faces=True,
     coefficients=(
         Coefficient(
             "drag_coefficient",

@@ -292,6 +292,7 @@ class DragLaw:
         steepest: bound g of the force's gradient: its derivative by the speed v is at most g ρ A v,
             with A the part's largest face; or a function: numbers → g A [m²]. None where there is
             none (drag that is linear in v) and for laws that a step takes explicitly.
+        by_faces: whether faces have the C_d that modules state, which may exceed that bound.
         coefficients: what users may give for it.
         parameters: checked class of more of them, which modules have under its name, and worlds
             where they have a field of this name.
@@ -305,6 +306,7 @@ class DragLaw:
     explicit: bool
     varied: bool
     steepest: float | Callable[[Any], np.ndarray] | None = None
+    by_faces: bool = False
     coefficients: tuple[Coefficient, ...] = ()
     parameters: type | None = None
     mj_fluidcoef: tuple[float, ...] = ()

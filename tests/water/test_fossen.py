@@ -13,6 +13,7 @@ from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.population import acceleration
 from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.engine.step_constants import read_constants
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.flow import water_of
 
@@ -122,6 +123,8 @@ def test_coefficients_may_differ_from_axis_to_axis():
         qvel[:3] = 0.8 * np.eye(3)
         after = march(braked, 0.1, qpos, qvel)[2][:, :3]
         assert (np.diff(np.linalg.norm(after, axis=1), axis=0) < 0).all()
+    idle = box_robot(SIZE, MASS, world(drag="off"), drag_coefficient=40.0)
+    assert not read_constants(idle.assembly).bounds.steep.any()
     # Params take them, too; one number is three of the same, bit for bit.
     same = box_robot(SIZE, MASS, still, drag_coefficient=(1.7,) * 3)
     turned = moving(same)
