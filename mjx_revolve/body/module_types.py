@@ -95,7 +95,7 @@ class Part:
         added_mass_coefficient: multiplies the main box's added mass; or three, along its axes [-].
         factors: fitted factors on coefficients of laws, by name, on LAW.FIELD of laws with
             parameters, or on all coefficients of `drag` or `added_mass` together.
-        contact: whether it touches the bed.
+        contact: whether it touches the bed, other parts and other robots.
         buoyancy: name of a buoyancy law; by default the world's. A law that the world switches off
             stays off; so for `drag` and `added_mass`.
         drag: name of a drag law of parts; by default "fossen" where that is stated, "lift_drag" for

@@ -115,10 +115,14 @@ class Assembly:
         return turned(up, self.position - self.position[self.parent]), up @ self.rotation
 
     @property
+    def touching(self) -> np.ndarray:
+        """`[npart]` whether a part touches anything."""
+        return np.array([part.contact for part in self.layout.parts], bool)[self.layout.kind]
+
+    @property
     def point_part(self) -> np.ndarray:
         """`[npoint]` the part of which each point is a corner."""
-        touching = np.array([part.contact for part in self.layout.parts])[self.layout.kind]
-        return np.repeat(np.flatnonzero(touching), 8)
+        return np.repeat(np.flatnonzero(self.touching), 8)
 
     @property
     def halves(self) -> tuple[np.ndarray, np.ndarray]:
@@ -145,8 +149,7 @@ class Assembly:
     @cached_property
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """`[npoint]` body of each point that may touch the bed; `[npoint, 3]` body frame [m]."""
-        layout, table = self.layout, self.fluid
-        touching = np.array([part.contact for part in layout.parts])[layout.kind]
+        layout, table, touching = self.layout, self.fluid, self.touching
         corners = layout.corners()[touching] @ table.rotation[touching].swapaxes(1, 2)
         place = table.position[touching, None] + corners
         return np.repeat(table.body[touching], 8), place.reshape(-1, 3)

@@ -32,8 +32,8 @@ def candidate_pairs(assembly: Assembly) -> Int[np.ndarray, "pairs 2"]:
     """Pairs of parts that might meet: of different rigid bodies of the same robot.
 
     Left out are parts of a rigid body and of the one that carries it, as the hinge between them
-    ends before they meet (see `hinge_stops`), and parts that overlap at rest by more than
-    `REST_OVERLAP`.
+    ends before they meet (see `hinge_stops`), parts that overlap at rest by more than
+    `REST_OVERLAP`, and those without contact.
 
     Args:
         assembly: of a robot, or of several.
@@ -46,6 +46,7 @@ def candidate_pairs(assembly: Assembly) -> Int[np.ndarray, "pairs 2"]:
     first, second = pairs_within(robot, robot)
     a, b = body[first], body[second]
     apart = (first < second) & (a != b) & (parent[a] != b) & (parent[b] != a)
+    apart &= assembly.touching[first] & assembly.touching[second]
     pairs = np.stack([first[apart], second[apart]], 1)
     if not len(pairs):
         return pairs
@@ -169,8 +170,9 @@ def hinge_stops(assembly: Assembly) -> Float[np.ndarray, "nbody 2"]:
     """Angles at which hinges end: their range, less where their own neighbours would meet.
 
     Neighbours are the parts of the rigid body that carries the hinge and of the one that it
-    carries, but for those of one module and those that overlap or touch at rest: boxes that stand
-    end to end at a hinge, as in models of chains, stand for shapes that let it turn.
+    carries, but for those without contact, those of one module and those that overlap or touch at
+    rest: boxes that stand end to end at a hinge, as in models of chains, stand for shapes that let
+    it turn.
 
     Args:
         assembly: of a robot, or of several.
@@ -189,6 +191,7 @@ def hinge_stops(assembly: Assembly) -> Float[np.ndarray, "nbody 2"]:
     far = [np.linalg.norm(place[part] - assembly.position[hinge], axis=1) for part in pairs.T]
     near = np.abs(far[0] - far[1]) < radius[pairs].sum(1)
     near &= table.module[pairs[:, 0]] != table.module[pairs[:, 1]]
+    near &= assembly.touching[pairs].all(1)
     pairs = pairs[near]
     if not len(pairs):
         return stops

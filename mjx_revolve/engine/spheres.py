@@ -78,7 +78,8 @@ def _balls(assembly: Assembly) -> _Ball:
     table = assembly.fluid
     body, center, radius = [], [], []
     known: dict[tuple[float, ...], tuple[np.ndarray, float]] = {}
-    for k, half in enumerate(map(tuple, table.half_size.tolist())):
+    for k in np.flatnonzero(assembly.touching):
+        half = tuple(table.half_size[k].tolist())
         if half not in known:
             known[half] = sphere_box(half)
         places, size = known[half]
@@ -155,7 +156,4 @@ def pack_spheres(
 
 def count_spheres(robots: Sequence[Robot]) -> int:
     """The most spheres that any of some robots has."""
-    return max(
-        (int(np.sum([len(sphere_box(h)[0]) for h in robot.fluid.half_size])) for robot in robots),
-        default=0,
-    )
+    return max((len(_balls(robot.assembly).body) for robot in robots), default=0)

@@ -157,20 +157,30 @@ class NamedGenes:
         """Genes by name, the first parent's first, with noise.
 
         A copied joint has the genes of its original, a new one those of the nearest joint with
-        inherited genes; if there is none, they are drawn.
+        inherited genes; if there is none, they are drawn. A pair whose joints have changed their
+        order has the negative gene.
         """
         noise = self.settings.mutation * rng.standard_normal(len(layout.names))
         fresh = self.settings.std_init * rng.standard_normal(len(layout.names))
-        known = {k: v for p in reversed(parents) for k, v in p.items()}
+
+        def look(brain: dict[str, float], gene: Gene, joints: Sequence[str]) -> float | None:
+            value = brain.get(f"{gene.what} {'~'.join(joints)}")
+            if value is None and gene.place == "pair":  # the other way round
+                opposite = brain.get(f"{gene.what} {'~'.join(reversed(joints))}")
+                return None if opposite is None else -opposite
+            return value
 
         def find(name: str, gene: Gene) -> float | None:
-            joints = name[len(gene.what) + 1 :].split("~")
-            if gene.place == "robot" or origins.keys().isdisjoint(joints):
-                return known.get(name)
-            # A copy's name may be that of another joint, which the body has lost, or a parent has.
-            which, named = zip(*(origins.get(joint, (0, joint)) for joint in joints), strict=True)
-            own = parents[which[0]] if len(set(which)) == 1 else {}
-            return own.get(f"{gene.what} {'~'.join(named)}")
+            joints: Sequence[str] = name[len(gene.what) + 1 :].split("~")
+            known = parents
+            if gene.place == "robot":
+                return next((brain[name] for brain in parents if name in brain), None)
+            if not origins.keys().isdisjoint(joints):
+                # A copy may have the name of another joint, which the body lost or a parent has.
+                which, joints = zip(*(origins.get(x, (0, x)) for x in joints), strict=True)
+                known = [parents[which[0]]] if len(set(which)) == 1 else []
+            values = (look(brain, gene, joints) for brain in known)
+            return next((value for value in values if value is not None), None)
 
         found = [find(*gene) for gene in zip(layout.names, layout.genes, strict=True)]
         have = np.array([value is not None for value in found], bool)

@@ -426,12 +426,15 @@ def _read_mjcf(root: Element, path: Path) -> RigidRobot:
         link.inertia += _spread(float(model.body_mass[body]), center, axes, moments)
         for geom in np.flatnonzero(model.geom_bodyid == body):
             _mjcf_shape(model, int(geom), place, link, missing)
+    turns = np.isin(model.actuator_trntype, list(_MOVES_JOINTS))
     for count, words in (
         ((model.geom_bodyid == 0).sum(), "geoms of the world"), (model.neq, "equality constraints"),
         (model.ntendon, "tendons"), (model.nsensor, "sensors"),
         (model.dof_frictionloss.any(), "friction of joints"),
         (model.dof_damping.any(), "damping of joints"), (model.dof_armature.any(), "armatures"),
         (model.jnt_stiffness.any(), "springs of joints"),
+        ((~turns).sum(), "actuators that move no joint, such as thrusters"),
+        (model.body_gravcomp.any(), "weights taken off bodies (gravcomp)"),
         (np.bool_(model.opt.density or model.opt.viscosity), "MuJoCo's fluid"),
     ):  # fmt: skip
         if count:

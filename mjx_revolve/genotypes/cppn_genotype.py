@@ -105,13 +105,15 @@ def grow(network: CPPN, space: Space) -> Morphology:
         best = found[:, :-1].argmax(axis=1).tolist()
         turns = np.rint(found[:, -1]).tolist()
         after = []
-        for (parent, slot), place, which, turn in zip(wave, slots_at, best, turns, strict=True):
-            if which == 0:
+        # The surest first, so that where two overlap, no side is preferred by the slots' numbers.
+        margin = found[:, :-1].max(axis=1) - found[:, 0]
+        for k in np.argsort(-margin, kind="stable").tolist():
+            if best[k] == 0:
                 continue
-            kind = space.kinds[which - 1]
-            index = growth.attach(parent, slot, kind, 90.0 * (turn % 4.0))
+            (parent, slot), kind = wave[k], space.kinds[best[k] - 1]
+            index = growth.attach(parent, slot, kind, 90.0 * (turns[k] % 4.0))
             if index is not None:
-                places.append(place)
+                places.append(slots_at[k])
                 after += [(index, number) for number in kind.slots]
         wave, depth = after, depth + 1.0
     return growth.finish("robot")

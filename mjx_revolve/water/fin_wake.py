@@ -101,7 +101,7 @@ def _numbers(parts: PartShapes, world: World) -> FinWakeNumbers:
     chord = (np.abs(plate.forward) * 2 * parts.half_size).sum(-1)
     stall = plate.alpha_stall
     left = np.pi / 2 - stall
-    across = plate.cda * stall + plate.cda_stall * left
+    across = np.abs(plate.cda * stall + plate.cda_stall * left)
     flat = np.divide(across, left, out=np.zeros_like(left), where=left > 1e-6)
     induced = chord**2 / (np.pi * _EFFICIENCY * np.maximum(plate.area, 1e-30))
     steepest = np.maximum(np.abs(plate.cla), np.abs(plate.cla_stall))
@@ -117,7 +117,7 @@ def _numbers(parts: PartShapes, world: World) -> FinWakeNumbers:
         camber=np.tan(plate.a0),
         steepest=tangent,
         flat=flat,
-        gradient=own + np.maximum(flat, 2 * np.abs(across)),
+        gradient=own + np.maximum(flat, 2 * across),
     )
 
 
@@ -180,7 +180,7 @@ def _force(flow: PartFlow, fin: FinWakeNumbers, world: World) -> Drag:
 def _remember(flow: PartFlow, fin: FinWakeNumbers, world: World, dt: float) -> tuple[Scalar, ...]:
     fin = _cast(fin, flow.memory[0])
     speed, w = _incidence(flow, fin)
-    w, half_chords = mul(w, flow.submerged), mul(2 * dt / fin.chord, speed)
+    w, half_chords = jnp.where(flow.submerged > 0, w, 0), mul(2 * dt / fin.chord, speed)
     pairs = zip(_LAGS, flow.memory, strict=True)
     return tuple(w + (z - w) * jnp.exp(-rate * half_chords) for (_, rate), z in pairs)
 

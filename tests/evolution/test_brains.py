@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from laboratory import body
-from mjx_revolve.body.edits import add_module, remove_module
+from mjx_revolve.body.edits import add_module, remove_module, swap_subtrees
 from mjx_revolve.control.cpg import make_cpg
 from mjx_revolve.control.sine import make_sine
 from mjx_revolve.engine.plant import plant_of
@@ -19,8 +19,12 @@ SNAKE = body("snake")
 LAKE = load_world("lake")
 
 
+def built(morphology):
+    return build_robot(morphology, LAKE)
+
+
 def layout_of(morphology, make=make_sine, common=None):
-    plant = plant_of(build_robot(morphology, LAKE))
+    plant = plant_of(built(morphology))
     own = make(plant)
     return gene_layout(own, common or own, plant)
 
@@ -110,6 +114,25 @@ def test_of_two_parents_the_first_ones_joints_come_first():
     second = dict.fromkeys(large.names, 2.0)
     child = brains.inherit(np.random.default_rng(0), [first, second], large)
     assert child == second | first
+
+
+def test_a_pair_keeps_its_gene_when_its_joints_change_their_order():
+    """The coupling of i from j is the negative of that of j from i."""
+    spider = body("spider")
+    legs = [module.name for module in spider.modules if module.parent == 0]
+    changed = swap_subtrees(spider, legs[0], legs[2])
+    before, after = (layout_of(x, make_cpg) for x in (spider, changed))
+    brains = make_brain_encoding(BrainsConfig(mutation=0.0), make_cpg(plant_of(built(spider))))
+    parent = {name: 1.0 + k for k, name in enumerate(before.names)}
+    child = brains.inherit(np.random.default_rng(0), [parent], after)
+    turned = [name for name in after.names if name not in parent]
+    assert 0 < len(turned) < sum(name.startswith("c ") for name in after.names)
+    for name in after.names:
+        one, _, other = name.removeprefix("c ").partition("~")
+        assert child[name] == (-parent[f"c {other}~{one}"] if name in turned else parent[name])
+    # What the first parent has the other way round comes before what the second has as it stands.
+    second = dict.fromkeys(after.names, 99.0)
+    assert brains.inherit(np.random.default_rng(0), [parent, second], after) == child
 
 
 def test_a_copy_does_as_its_original():

@@ -94,7 +94,7 @@ def built(robot):
     return build_robot(robot.morphology, WATER)
 
 
-@pytest.mark.parametrize("name", ["spider", "fish", "odd", "auv"])
+@pytest.mark.parametrize("name", ["spider", "fish", "odd", "auv", "salamander"])
 @pytest.mark.parametrize("kind", ["robot.urdf", "robot.xml"])
 def test_what_is_exported_comes_back(name, kind, tmp_path):
     robot = lake_robot(name)
@@ -272,6 +272,16 @@ def test_what_is_changed_is_named(tmp_path):
     )
     robot = import_robot(write(tmp_path, damped, "robot.xml"))
     assert {"damping of joints", "armatures"} <= {*robot.missing}
+    driven = (
+        MJCF.replace("</worldbody>", "</worldbody><actuator>__</actuator>")
+        .replace("</actuator><actuator>", "")
+        .replace("__", '<adhesion body="shin" ctrlrange="0 1"/>')
+        .replace('<body name="shin"', '<body name="shin" gravcomp="1"')
+    )
+    assert {
+        "1 × actuators that move no joint, such as thrusters",
+        "weights taken off bodies (gravcomp)",
+    } <= {*import_robot(write(tmp_path, driven, "robot.xml")).missing}
     assert "red: 1.0, green: 0.0, blue: 0.0" in dump_yaml(robot.files[0], default_flow_style=None)
 
 

@@ -55,12 +55,12 @@ def fin():
     return numbers_of(FIN_WAKE, robot, 1)
 
 
-def past(law, numbers, velocities, dt):
+def past(law, numbers, velocities, dt, submerged=1.0):
     """What a law remembers after steps of velocities `[T, 3]` of a part that does not turn."""
     still = (jnp.zeros(()),) * 3
 
     def step(memory, v):
-        flow = PartFlow((v[0], v[1], v[2]), still, 1.0, memory)
+        flow = PartFlow((v[0], v[1], v[2]), still, submerged, memory)
         return law.remember(flow, numbers, WATER, dt), (memory, law.force(flow, numbers, WATER)[0])
 
     first = (jnp.zeros(()),) * law.memory
@@ -188,11 +188,38 @@ def test_a_fin_in_steady_flow_lifts_as_before_and_its_drag_follows(fin):
     assert drag == pytest.approx(lift * np.tan(angle) + friction, rel=1e-3)
     plain = LIFT_DRAG.force(PartFlow(tuple(velocity), (0.0,) * 3, 1.0), fin, WATER).force
     assert force @ across == pytest.approx(np.array(plain) @ across, rel=1e-4)
+    # Half out, half of it; dry, the wake is forgotten.
+    wet, half = np.tile(velocity, (3000, 1)), jnp.asarray(0.5)
+    (kept, (_, there)) = past(FIN_WAKE, fin, wet, 0.02, half)
+    np.testing.assert_allclose(np.array(there)[:, -1], force / 2, rtol=1e-3, atol=1e-6)
+    dry = PartFlow(tuple(map(jnp.asarray, velocity)), (jnp.zeros(()),) * 3, jnp.zeros(()), kept)
+    after = FIN_WAKE.remember(dry, fin, WATER, 10.0)
+    assert np.all(np.abs(after) < 0.1 * np.abs(kept))
 
 
-@pytest.mark.parametrize("law", [PLATE_WAKE, FIN_WAKE], ids=lambda law: law.name)
-def test_whatever_is_remembered_the_water_never_works_and_gradients_are_finite(law, plate, fin):
-    numbers = plate if law is PLATE_WAKE else fin
+# As Gazebo's models have them: their drag past the stall falls, and counts by its size.
+ZEPHYR = """
+modules:
+  Wing:
+    mount: {position: [-0.05, 0, 0], outward: [1, 0, 0]}
+    parts:
+    - size: [0.1, 0.12, 0.004]
+      mass: 0.05
+      lift_drag: {a0: 0.06, cla: 4.75, cda: 0.64, alpha_stall: 0.34, cla_stall: -3.85,
+                  cda_stall: -0.92, forward: [1, 0, 0], upward: [0, 0, 1]}
+"""
+
+
+@pytest.fixture(scope="module")
+def wing():
+    tree = {"type": "Core", "children": {0: {"type": "Wing"}}}
+    robot = build_robot(make_morphology({"body": tree}, modules=modules(ZEPHYR)), WATER)
+    return numbers_of(FIN_WAKE, robot, 1)
+
+
+@pytest.mark.parametrize("kind", ["plate", "fin", "wing"])
+def test_whatever_is_remembered_the_water_never_works_and_gradients_are_finite(kind, request):
+    numbers, law = request.getfixturevalue(kind), PLATE_WAKE if kind == "plate" else FIN_WAKE
     v, w, size = np.random.default_rng(2).normal(size=(3, 4, 300))
     memory = size if law is FIN_WAKE else np.concatenate([size[:2], size[2:] ** 2])
     flow = PartFlow(tuple(v[:3]), tuple(5 * w[:3]), 1.0, tuple(memory[: law.memory]))
