@@ -17,7 +17,7 @@ from mjx_revolve.inputs.errors import InputError
 # Boxes are shrunk by this much at each face [m] before they are tested for overlap, thin ones by
 # half their half-edge at most. A choice: a brick's box stands 1.5 mm proud of its attachment faces,
 # so that two bricks on adjacent faces of a third overlap by 3 mm by design.
-OVERLAP_TOLERANCE = 0.002
+OVERLAP_TOLERANCE = 0.0016
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -34,7 +34,7 @@ def self_overlap(robot: Robot, qpos: Float[np.ndarray, "T nq"]) -> SelfOverlap:
     """How deep modules of a robot overlap, exactly: by the 15 separating axes of their main boxes.
 
     Compared are parts of different rigid bodies, but for those of a rigid body and of the one that
-    carries it by a hinge, and for parts that overlap at rest (all joints at 0).
+    carries it by a hinge, and for modules that are built into each other.
 
     Args:
         robot: from `build_robot`.
@@ -67,7 +67,7 @@ def self_overlap(robot: Robot, qpos: Float[np.ndarray, "T nq"]) -> SelfOverlap:
         gap[near] = box_gap(pair)
         deepest = np.argmin(gap, 1)
         found = -gap[np.arange(len(rows)), deepest]
-        depth[start : start + step] = found
+        depth[start : start + step] = np.maximum(found, 0)
         which[start : start + step] = np.where(found > 0, deepest, -1)
     modules = np.append(pairs, [[0, 0]], 0)[which]
     first, second = np.where(which[:, None] < 0, -1, table.module[modules]).T

@@ -13,9 +13,13 @@ from mjx_revolve.numerics.boxes import BoxPair, box_gap, dot, matmul, matvec, pa
 if TYPE_CHECKING:
     from mjx_revolve.engine.assembly import Assembly
 
-# Parts that overlap by more than this at rest [m] are built that way, and pass through each other
-# later on, too. A choice: rounding.
-REST_OVERLAP = 1e-5
+# Boxes that are no farther apart at rest touch [m]. A choice: rounding.
+_TOUCH = 1e-5
+# From a hinge to a box that holds it [m]. A choice: what is built to end there ends there.
+_AT_HINGE = 1e-3
+# By how much neighbours that overlap at rest may do so more [m], so that a hinge is not locked by
+# what slides along each other. A choice: the overlap that contacts tolerate.
+_DEEPER = 5e-4
 # Angles beyond the end stops [rad] and gaps [m] that a pair must keep to be left out. Choices: end
 # stops give way by half a degree.
 _RANGE_MARGIN, _CLEARANCE = 0.02, 1e-3
@@ -32,8 +36,8 @@ def candidate_pairs(assembly: Assembly) -> Int[np.ndarray, "pairs 2"]:
     """Pairs of parts that might meet: of different rigid bodies of the same robot.
 
     Left out are parts of a rigid body and of the one that carries it, as the hinge between them
-    ends before they meet (see `hinge_stops`), parts that overlap at rest by more than
-    `REST_OVERLAP`, and those without contact.
+    ends before they meet (see `hinge_stops`), parts that overlap at rest because modules are built
+    that way (see `_built_into`), and those without contact.
 
     Args:
         assembly: of a robot, or of several.
@@ -50,7 +54,29 @@ def candidate_pairs(assembly: Assembly) -> Int[np.ndarray, "pairs 2"]:
     pairs = np.stack([first[apart], second[apart]], 1)
     if not len(pairs):
         return pairs
-    return pairs[part_gaps(assembly, pairs) > -REST_OVERLAP]
+    meets = part_gaps(assembly, pairs) > -_TOUCH
+    meets[~meets] = ~_built_into(assembly, pairs[~meets])
+    return pairs[meets]
+
+
+def _built_into(assembly: Assembly, pairs: np.ndarray) -> np.ndarray:
+    """`[pairs]` whether modules stand in one another as they are built.
+
+    One is attached to the other, or they overlap by more than may be without being allowed.
+    """
+    module = assembly.fluid.module[pairs]
+    if not len(pairs):
+        return np.zeros(0, bool)
+    above: list[int] = []
+    inside: set[frozenset[int]] = set()
+    for body in assembly.morphologies:
+        first = len(above)
+        above += [first + m.parent if m.parent >= 0 else -1 for m in body.modules]
+        index = {m.name: first + k for k, m in enumerate(body.modules)}
+        inside |= {frozenset((index[a], index[b])) for a, b in body.overlaps}
+    parent = np.array(above)
+    attached = (parent[module[:, 0]] == module[:, 1]) | (parent[module[:, 1]] == module[:, 0])
+    return attached | np.array([frozenset(pair) in inside for pair in module.tolist()], bool)
 
 
 def part_gaps(assembly: Assembly, pairs: np.ndarray) -> Float[np.ndarray, " pairs"]:
@@ -170,9 +196,10 @@ def hinge_stops(assembly: Assembly) -> Float[np.ndarray, "nbody 2"]:
     """Angles at which hinges end: their range, less where their own neighbours would meet.
 
     Neighbours are the parts of the rigid body that carries the hinge and of the one that it
-    carries, but for those without contact, those of one module and those that overlap or touch at
-    rest: boxes that stand end to end at a hinge, as in models of chains, stand for shapes that let
-    it turn.
+    carries, but for those without contact, those of one module, and those that overlap or touch at
+    rest and are built so (see `_built_into`) or both hold the hinge: boxes that stand end to end
+    there, as in models of chains, stand for shapes that let it turn. Others that overlap by a few
+    millimetres get half a millimetre deeper at most.
 
     Args:
         assembly: of a robot, or of several.
@@ -195,7 +222,11 @@ def hinge_stops(assembly: Assembly) -> Float[np.ndarray, "nbody 2"]:
     pairs = pairs[near]
     if not len(pairs):
         return stops
-    pairs = pairs[part_gaps(assembly, pairs) > REST_OVERLAP]
+    meets = part_gaps(assembly, pairs) > _TOUCH
+    some = pairs[~meets]
+    holds = [_holds(assembly, part, body[some[:, 1]]) for part in some.T]
+    meets[~meets] = ~(_built_into(assembly, some) | (holds[0] & holds[1]))
+    pairs = pairs[meets]
     hinge = body[pairs[:, 1]]
 
     i, j = pairs.T
@@ -213,7 +244,8 @@ def hinge_stops(assembly: Assembly) -> Float[np.ndarray, "nbody 2"]:
         return box_gap(BoxPair(offset + moved[:, 0], fixed, moved[:, 1:], *halves))
 
     every = np.arange(len(pairs))
-    allowed = np.minimum(gap(np.zeros((1, len(pairs))), every)[0], 0) - 1e-6
+    rest = gap(np.zeros((1, len(pairs))), every)[0]
+    allowed = np.where(rest > _TOUCH, -1e-6, np.minimum(rest, 0) - _DEEPER)
     share = np.arange(1, _ANGLES + 1)[:, None] / _ANGLES
     for side, nearest in enumerate((np.maximum, np.minimum)):
         free, width, some = np.zeros(len(pairs)), stops[hinge, side], every
@@ -225,6 +257,15 @@ def hinge_stops(assembly: Assembly) -> Float[np.ndarray, "nbody 2"]:
             width[some] /= _ANGLES
         nearest.at(stops[:, side], hinge, free)
     return stops
+
+
+def _holds(assembly: Assembly, part: np.ndarray, hinge: np.ndarray) -> np.ndarray:
+    """`[n]` whether the boxes of parts reach to where hinges are."""
+    table, body = assembly.fluid, assembly.fluid.body[part]
+    there = assembly.position[hinge] - assembly.position[body]
+    there = turned(assembly.rotation[body].swapaxes(1, 2), there) - table.position[part]
+    there = turned(table.rotation[part].swapaxes(1, 2), there)
+    return (np.abs(there) < table.half_size[part] + _AT_HINGE).all(1)
 
 
 def hinge_levers(
