@@ -38,8 +38,8 @@ class Gene(NamedTuple):
 
     Attributes:
         what: the parameter that it encodes, such as "w" or "offset".
-        place: "hinge", "thruster", "pair" (of neighbouring hinges, the first one's index smaller; of
-            the pair the other way round, the gene is the negative) or "robot".
+        place: "hinge", "thruster", "pair" (of neighbouring hinges in their order; the other way
+            round the gene is the negative) or "robot".
         number: index of the hinge, thruster or pair.
     """
 

@@ -53,9 +53,10 @@ from mjx_revolve.episodes.rollout import RolloutState, with_variation
 from mjx_revolve.episodes.scoring import average_trials, list_episodes, max_distance, may_touch_bed
 from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.episodes.starts import Starts, episode_context, pick_water, target_path
-from mjx_revolve.episodes.tasks import TASKS, Task, find_task
+from mjx_revolve.episodes.tasks import TASKS, Task, find_task, start_at_depth
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.xla import materialize, over_chunks
+from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.drag import DRAG_LAWS, find_drag_law
 from mjx_revolve.water.flow import Water, water_of
 from mjx_revolve.water.world import World
@@ -687,6 +688,13 @@ def _place(config: Config) -> tuple[World, Task]:
             f"{config.origin('task.start_attitude')}task.start_attitude: expected level, as "
             f"{config.task.name} starts on the bed; found {config.task.start_attitude}"
         )
+    if world.bed is not None and task.start is start_at_depth and config.colony is None:
+        deepest = world.surface_height - float(bed_height(world.bed, *np.zeros((2, 1)))[0])
+        if config.task.depth >= deepest:
+            raise InputError(
+                f"{config.origin('task.depth')}task.depth: expected one above the bed, which is "
+                f"{deepest:g} m below the surface; found {config.task.depth:g}"
+            )
     _check_robust(config, world)
     return world, task
 

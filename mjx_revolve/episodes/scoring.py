@@ -77,7 +77,7 @@ def list_episodes(population: int, trials: int) -> tuple[jax.Array, jax.Array]:
 def first_scored_row(task: TaskConfig, timestep: float) -> int:
     """The row of a track at which the task begins to count; row 0 is one interval late."""
     every, rows = sample_rows(task, timestep)
-    return min(round(task.settle / (every * timestep)), rows - 2)
+    return min(int(task.settle / (every * timestep) + 1e-6), rows - 2)
 
 
 def extend_track(

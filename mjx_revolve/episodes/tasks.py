@@ -121,7 +121,7 @@ def start_at_depth(
 def start_on_bed(
     settings: TaskConfig, world: World, figure: BodyGeometry, place: jax.Array
 ) -> jax.Array:
-    """The lowest corner 5 mm above the bed, whatever the tilt; arguments of `start_at_depth`."""
+    """The lowest corner 5 mm above the bed, see `reach_below`; arguments of `start_at_depth`."""
     assert world.bed is not None
     below = reach_below(settings, figure)
     return place.at[2].set(bed_height(world.bed, place[0], place[1]) + below + 0.005)
@@ -138,10 +138,13 @@ def start_above_bed(
 def reach_below(settings: TaskConfig, figure: BodyGeometry) -> Scalar:
     """How far the rest pose reaches below the core's centre, in any attitude drawn [m].
 
-    A tilt of three standard deviations is taken for the largest.
+    Of all tilts up to three standard deviations, taken for the largest.
     """
     tilt = min(3 * settings.start_tilt, np.pi / 2)
-    return figure.lowest * np.cos(tilt) + figure.radius * np.sin(tilt)
+    lowest, radius = jnp.asarray(figure.lowest), jnp.asarray(figure.radius)
+    beyond = radius * np.cos(tilt) < lowest * np.sin(tilt)  # the deepest tilt is a smaller one
+    farthest = jnp.sqrt(lowest**2 + radius**2)
+    return jnp.where(beyond, farthest, lowest * np.cos(tilt) + radius * np.sin(tilt))
 
 
 @dataclass(frozen=True)
