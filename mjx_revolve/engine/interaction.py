@@ -44,9 +44,9 @@ _SPEED_MARGIN = 1.2
 # Pairs of robots tested together, pairs of spheres that they may add to the list, and pairs of
 # spheres with forces computed together: enough for vector registers, few enough that two
 # robots in contact do not cost as much as a crowd. Choices.
-_PAIRS, _FOUND, _PUSHED = 4, 512, 64
+_PAIRS, _FOUND, _PUSHED = 4, 2048, 64
 # Room in the list for so many pairs of spheres per robot; more than heaps have. A choice.
-_ROOM = 64
+_ROOM = 256
 # At most so many sweeps over all contacts, and what the last one may still change in the speed of
 # any [m/s]. Choices: two plates that meet flat need six.
 _SWEEPS, _ENOUGH = 16, 1e-3
@@ -470,7 +470,10 @@ class _Contact:
 
         moved, strayed = farthest(neighbours)
         stale = (moved > _SKIN / 2) | (strayed > _ROBOT_SKIN / 2)
-        neighbours = jax.lax.cond(stale, lambda: self._find(frames, neighbours), lambda: neighbours)
+        ahead = 2 * jnp.max(way)
+        neighbours = jax.lax.cond(
+            stale, lambda: self._find(frames, neighbours, ahead), lambda: neighbours
+        )
         moved, strayed = farthest(neighbours)
         shape = self.radius.shape
         nothing = jnp.zeros((6, shape[0] * shape[1]), self.radius.dtype)
@@ -486,19 +489,25 @@ class _Contact:
 
     # --- the neighbour list
 
-    def _find(self, frames: Frames, neighbours: NeighbourList) -> NeighbourList:
-        """A new list; where it has no room, one of spheres in contact, made at every step."""
+    def _find(self, frames: Frames, neighbours: NeighbourList, ahead: jax.Array) -> NeighbourList:
+        """A new list; where it has no room, one of what may meet in this step, made at every one.
+
+        And where that has none, of what touches. `ahead` is the way by which two spheres may near
+        each other in the step [m].
+        """
         place, near, close = self._balls(frames)
-        skin = jnp.asarray(_SKIN, self.radius.dtype)
-        found, whole = self._spheres(place, near, skin, neighbours)
-        zero, never = jnp.zeros_like(neighbours.moved), jnp.full_like(neighbours.moved, jnp.inf)
-        found = found._replace(close=close, moved=zero, strayed=zero)
+        usual = jnp.asarray(_SKIN, ahead.dtype)
+        skins = jnp.stack([usual, jnp.minimum(ahead, usual), jnp.zeros_like(usual)])
 
-        def only_touching() -> NeighbourList:
-            few, _ = self._spheres(place, near, jnp.zeros_like(skin), neighbours)
-            return few._replace(close=close, moved=never, strayed=never)
+        def attempt(carry: Any) -> Any:
+            count, _, found = carry
+            found, whole = self._spheres(place, near, skins[count], found, count == len(skins) - 1)
+            return count + 1, whole, found
 
-        return jax.lax.cond(whole, lambda: found, only_touching)
+        start = jnp.int32(0), jnp.bool_(False), neighbours
+        count, _, found = jax.lax.while_loop(lambda x: (x[0] < len(skins)) & ~x[1], attempt, start)
+        moved = jnp.where(count == 1, 0, jnp.inf).astype(ahead.dtype)
+        return found._replace(close=close, moved=moved, strayed=moved)
 
     def _balls(self, frames: Frames) -> tuple[Vec, jax.Array, jax.Array]:
         """Positions of all spheres, pairs of robots that may touch, and robots with others close.
@@ -522,9 +531,17 @@ class _Contact:
         return place, square < (both + _SKIN) ** 2, close
 
     def _spheres(
-        self, place: Vec, near: jax.Array, skin: jax.Array, neighbours: NeighbourList
+        self,
+        place: Vec,
+        near: jax.Array,
+        skin: jax.Array,
+        neighbours: NeighbourList,
+        last: jax.Array,
     ) -> tuple[NeighbourList, jax.Array]:
-        """The pairs of spheres that are nearer than `skin`, and whether the list holds all."""
+        """The pairs of spheres that are nearer than `skin`, and whether the list holds all.
+
+        A list that has no room for all is not used, and need not be finished, but for the `last`.
+        """
         lanes, n = self.trees.lanes, near.shape[-1]
         near = (near & jnp.triu(jnp.ones((n, n), bool), 1)).reshape(-1)
         number, end = jnp.arange(near.size, dtype=jnp.int32), jnp.int32(near.size)
@@ -580,8 +597,7 @@ class _Contact:
             after(jnp.int32(-1)), neighbours.first, neighbours.second, jnp.int32(0),
             jnp.bool_(True), jnp.full_like(neighbours.gap, jnp.inf),
         )  # fmt: skip
-        # A list with a skin that has no room is not used.
-        wanted = lambda x: (x[0] < end) & (x[4] | (skin == 0))  # noqa: E731
+        wanted = lambda x: (x[0] < end) & (x[4] | last)  # noqa: E731
         _, first, second, total, whole, gap = jax.lax.while_loop(wanted, block, carry)
         return neighbours._replace(first=first, second=second, pairs=total, gap=gap), whole
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from laboratory import QUICK, body, box_robot, world
+from mjx_revolve.engine import interaction
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.interaction import (
@@ -146,6 +147,18 @@ def test_forces_are_equal_and_opposite(seed):
     assert np.abs(force.sum((0, 2))).max() < 1e-12 * size
     assert np.abs(torque.sum((0, 2))).max() < 1e-12 * size
     assert np.all(force[..., 6:] == 0) and np.all(np.abs(force[..., :6]).max((0, 1)) > 0)
+
+
+def test_a_list_without_room_for_all_that_is_near_has_what_meets_in_the_step(monkeypatch):
+    qpos, qvel = crowd(1, spread=0.2)
+    qvel = qvel.at[:3].multiply(3)
+    every = jnp.ones(8, bool)
+    frames, usual = meeting_of()(qpos, qvel, every)
+    expected, _ = wrenches(usual, frames)
+    monkeypatch.setattr(interaction, "_ROOM", 12)
+    frames, few = meeting_of.__wrapped__()(qpos, qvel, every)
+    assert np.abs(expected).max() > 1
+    np.testing.assert_allclose(wrenches(few, frames)[0], expected, rtol=1e-9, atol=1e-9)
 
 
 def test_worlds_do_not_feel_each_other():
