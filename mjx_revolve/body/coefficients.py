@@ -96,23 +96,36 @@ def _correct(module: Module, entries: Entries, source: str) -> Module:
         entry = _suited(entries.get(name, {}), kind)
         if not entry:
             continue
-        before, more = params.get("factors", {}), entry.get("factors", {})
-        ballast = params.get("ballast", 0.0)
-        if ballast and "ballast" in entry and "ballast_position" in params | entry:
+        ballast, placed = params.get("ballast", 0.0), "ballast_position" in params
+        if ballast and "ballast" in entry and placed != ("ballast_position" in entry):
             raise InputError(
                 f"{source}: modules.{name}.ballast: expected none, as {module.name} has its own "
-                f"in a place of its own; found {entry['ballast']:g}"
+                f"{'in' if placed else 'without'} a place of its own; found {entry['ballast']:g}"
             )
-        params |= entry
-        if "ballast" in entry:  # which adds to the mass
+        params = merge_params(params, entry)
+        if "ballast" in entry and not placed:  # which adds to the mass; a placed one replaces
             params["ballast"] += ballast
-        if before or more:
-            both = {k: multiply_factors(x, before.get(k, 1.0)) for k, x in more.items()}
-            params["factors"] = before | both
     if params == module.params:
         return module
     # Of the type and all params at once, as the saved robot is read.
     return replace(module, kind=apply_overrides(kind, params), params=params, base=kind)
+
+
+def merge_params(params: Mapping[str, Any], entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Params of a module with further ones: factors multiply, numbers of laws and thrusters join.
+
+    Of a thruster with another curve, all numbers are the further ones.
+    """
+    found = dict(params) | dict(entry)
+    for key in ("thruster", "lift_drag"):
+        old, new = params.get(key, {}), entry.get(key, {})
+        if old and new and new.get("curve", old.get("curve")) == old.get("curve"):
+            found[key] = old | new
+    before, more = params.get("factors", {}), entry.get("factors", {})
+    if before or more:
+        both = {k: multiply_factors(x, before.get(k, 1.0)) for k, x in more.items()}
+        found["factors"] = before | both
+    return found
 
 
 def _suited(entry: Mapping[str, object], kind: ModuleType) -> dict[str, Any]:

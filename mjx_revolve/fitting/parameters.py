@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_revolve.body.coefficients import ALL, correct_modules
+from mjx_revolve.body.coefficients import ALL, correct_modules, merge_params
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.body.params import MODULE_FACTORS
@@ -70,10 +70,32 @@ class Parameter:
 
 def with_values(robot: Robot, parameters: Sequence[Parameter], offsets: np.ndarray) -> Robot:
     """The robot with values of its free numbers."""
-    modules = robot.morphology.modules
-    for parameter, offset in zip(parameters, offsets, strict=True):
-        modules = correct_modules(modules, parameter.entries(parameter.value(float(offset))), "fit")
+    entries = entries_of(robot, parameters, offsets)
+    modules = correct_modules(robot.morphology.modules, entries, "fit")
     return Robot(replace(robot.morphology, modules=modules), robot.world)
+
+
+def entries_of(
+    robot: Robot, parameters: Sequence[Parameter], offsets: np.ndarray
+) -> dict[str, dict[str, Any]]:
+    """Params of values of free numbers, by type of module, module or `all`.
+
+    Numbers of one thruster join, and so do coordinates of one ballast.
+    """
+    at = {m.name: m.kind.parts[0].ballast_position for m in robot.morphology.modules}
+    found: dict[str, dict[str, Any]] = {}
+    for parameter, offset in zip(parameters, offsets, strict=True):
+        for where, params in parameter.entries(parameter.value(float(offset))).items():
+            own = found.get(where, {})
+            found[where] = merge_params(own, params)
+            if "ballast_position" in own and "ballast_position" in params:
+                found[where]["ballast_position"] = [
+                    new if new != start else old
+                    for old, new, start in zip(
+                        own["ballast_position"], params["ballast_position"], at[where], strict=True
+                    )
+                ]
+    return found
 
 
 def split_free(names: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -172,7 +194,9 @@ def _plain_value(
             module: part.thruster
             for module, kind in kinds.items()
             for part in kind.parts
-            if part.thruster is not None and getattr(part.thruster, field) is not None
+            if part.thruster is not None
+            and getattr(part.thruster, field) is not None
+            and not (field == "gain" and part.thruster.curve == "interpolated")
         }
         if not jets:
             raise InputError(
@@ -201,7 +225,10 @@ def _plain_value(
         most = _BALLAST_SHARE * body.mass
         start = part.ballast_mass or most
         spread = math.log(2.0) if part.ballast_mass else 1.0
-        put = lambda v: {module: {"ballast": v, "ballast_position": at}}  # noqa: E731
+        [params] = [m.params for m in body.modules if m.name == module]
+        # What has none of a place is spread over the module, and so is what is found.
+        place = {} if params.get("ballast") and part.ballast_mass == 0 else {"ballast_position": at}
+        put = lambda v: {module: {"ballast": v} | place}  # noqa: E731
         return Parameter(text, "kg", start, spread, True, put)
     if field not in ("x", "y", "z"):
         return None

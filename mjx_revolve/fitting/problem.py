@@ -6,10 +6,11 @@ that are free, so that neither drift nor chaos outlives a window.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -220,9 +221,15 @@ class FitProblem:
             drive = replace(drive, ctrl=ctrl)
         return simulate_windows(self.variants, robots, drive, roots, current, self.every)
 
-    def simulate(self, points: Sequence[Point]) -> np.ndarray:
-        """`[points, R, K, records, 13 + hinges]`; commands at the first one's clock."""
-        robots = [with_values(self.robot, self.parameters, p.free) for p in points]
+    def simulate(self, points: Sequence[Point], unchanged: bool = False) -> np.ndarray:
+        """`[points, R, K, records, 13 + hinges]`; commands at the first one's clock.
+
+        `unchanged`: of the robot as it was, whatever the points' numbers of it.
+        """
+        robots = [
+            self.robot if unchanged else with_values(self.robot, self.parameters, p.free)
+            for p in points
+        ]
         padded = [*points] + [points[0]] * (self.lanes - len(points))
         robots += [robots[0]] * (self.lanes - len(points))
         still = replace(self, drive=replace(self.drive, later=np.zeros(self.lanes, bool)))
@@ -390,7 +397,7 @@ def make_problem(
     angles, speeds = (
         np.stack([v.hinges_at(v.begin, prescribed, dt)[k] for v in views], -1) for k in range(2)
     )
-    drive = Drive(resets, angles, speeds, ctrl, later)
+    drive = Drive(resets, angles, speeds, ctrl, later, begin)
     channels = [
         channel
         for r, view in enumerate(views)
@@ -408,9 +415,23 @@ def make_problem(
 def _variants(robot: Robot, names: tuple[str, ...], prescribed: tuple[bool, ...]) -> Variants:
     """Variants of a robot with free parameters; cached, so that nothing compiles twice."""
     parameters = read_free(names, robot)
-    tried = [with_values(robot, parameters, np.zeros(len(names)))]
-    tried += [with_values(robot, parameters, 0.1 * x) for x in np.eye(len(names))]
-    return make_variants(tried, prescribed)
+    build = partial(with_values, robot, parameters)
+    usual, near = build(np.zeros(len(names))), [build(0.1 * x) for x in np.eye(len(names))]
+    for name, other in zip(names, near, strict=True):
+        if not make_variants([usual, other], prescribed).rows:
+            raise InputError(
+                f"--free {name}: expected a number that this robot in its water depends on; found "
+                "one that changes nothing"
+            )
+    far = []
+    for sign in (-1, 1):
+        # Some numbers of the step, such as bounds, change only from a threshold on.
+        ends = np.array([p.bound(sign * (np.inf if p.positive else 10 * p.spread))
+                         for p in parameters])  # fmt: skip
+        for offsets in (ends, *np.diag(ends)):
+            with contextlib.suppress(InputError):  # no such robot
+                far.append(build(offsets))
+    return make_variants([usual, robot, *near, *far], prescribed)
 
 
 def _held_out(count: int, share: float) -> np.ndarray:
@@ -684,7 +705,7 @@ class _View:
 
 
 def _turn_error(quat: np.ndarray, seen: np.ndarray, level: bool) -> np.ndarray:
-    """`[V, n, 3]` rotation from seen to simulated, or `[V, n, 1]` about z [rad]."""
+    """`[V, n, 3]` rotation θ from seen to simulated, 2 sin(θ/2), or `[V, n, 1]` about z [rad]."""
     w, v = seen[:, :1], -seen[:, 1:]
     real = w[:, 0] * quat[..., 0] - np.sum(v * quat[..., 1:], -1)
     imaginary = (
@@ -695,4 +716,4 @@ def _turn_error(quat: np.ndarray, seen: np.ndarray, level: bool) -> np.ndarray:
     if level:
         yaw = 2 * np.arctan2(imaginary[..., 2], real)
         return ((yaw + np.pi) % (2 * np.pi) - np.pi)[..., None]
-    return 2 * imaginary * np.sign(real)[..., None]
+    return 2 * imaginary * np.where(real < 0, -1, 1)[..., None]

@@ -159,11 +159,9 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
 def _read_mark(key: str, source: str, robot: Robot) -> MarkedPoint:
     module, _, at = source.partition(":")
     names = [m.name for m in robot.morphology.modules]
-    try:
-        place = tuple(float(x) for x in at.split(",")) if at else (0.0, 0.0, 0.0)
-    except ValueError:
-        place = ()
-    if module not in names or len(place) != 3:
+    read = [_finite(x) for x in at.split(",")] if at else [0.0, 0.0, 0.0]
+    place = [x for x in read if x is not None]
+    if module not in names or not len(read) == len(place) == 3:
         raise InputError(
             f"--map {key}: expected a module ({', '.join(names)}), or MODULE:X,Y,Z [m]; found "
             f"{show(source)}"
@@ -244,13 +242,13 @@ def _name_columns(
             usual = 1.0 if factor or column == name else _unit(column)[1]
             found[name] = header.index(column), _factor(name, factor) if factor else usual
             continue
-        try:
-            found[name] = None, float(source)
-        except ValueError:
+        number = _finite(source)
+        if number is None:
             raise InputError(
                 f"--map {name}: expected one of the columns {', '.join(header)}, also with "
                 f"*FACTOR, or a number; found {show(source)}"
-            ) from None
+            )
+        found[name] = None, number
         if name == "time":
             raise InputError(f"--map time: expected a column; found the number {source}")
     modules = [m.name for m in robot.morphology.modules]
@@ -278,10 +276,19 @@ def _name_columns(
 
 
 def _factor(name: str, text: str) -> float:
+    number = _finite(text)
+    if number is None:
+        raise InputError(f"--map {name}: expected a number after *; found {show(text)}")
+    return number
+
+
+def _finite(text: str) -> float | None:
+    """A finite number; None for other text."""
     try:
-        return float(text)
+        number = float(text)
     except ValueError:
-        raise InputError(f"--map {name}: expected a number after *; found {show(text)}") from None
+        return None
+    return number if math.isfinite(number) else None
 
 
 def _unit(column: str) -> tuple[str, float]:
@@ -444,6 +451,11 @@ def _check_signals(
     seen = [n for n in signals if n in _POSE or n in _SENSED or n.startswith("mark.")]
     if not any(n in ("x", "mean_speed") or n.startswith("mark.") for n in signals):
         raise InputError("expected x and y of the core, marks, or mean_speed; found none of them")
+    if (speed := signals.get("mean_speed")) is not None:
+        if len(speed.time) < 2:
+            raise InputError("mean_speed: expected rows from two times on; found one")
+        if (low := float(np.mean(speed.value))) < 0:
+            raise InputError(f"mean_speed: expected at least 0 m/s; found {low:g}")
     quat = [f"q{axis}" for axis in "wxyz"]
     for given, needed in ((("roll", "pitch"), ["qw" if "qw" in signals else "yaw"]), (quat, quat)):
         there = [n for n in given if n in signals]

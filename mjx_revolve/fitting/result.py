@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from mjx_revolve.body.params import multiply_factors
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.fitting.estimate import FitState, Model, advance, begin, linearize
 from mjx_revolve.fitting.identify import Unknown, find_unknown, is_found, plan_motions
 from mjx_revolve.fitting.intervals import LEVEL, Estimate, estimate
-from mjx_revolve.fitting.parameters import with_values
+from mjx_revolve.fitting.parameters import entries_of, with_values
 from mjx_revolve.fitting.problem import FitProblem, FitSettings, make_problem
 from mjx_revolve.fitting.recording import RobotRecording
 from mjx_revolve.inputs.yaml_reader import dump_yaml
@@ -68,7 +67,8 @@ class Prediction:
     def error(self, which: np.ndarray, held: bool) -> float:
         """Root mean square distance of `fitted` or `before` from what was recorded [m]."""
         rows = self.held if held else ~self.held
-        off = (which - self.recorded)[rows & np.isfinite(self.recorded).any(1)]
+        off = which - self.recorded
+        off = off[rows & np.isfinite(off).any(1)]
         return float(np.sqrt(np.nansum(off**2, 1).mean())) if len(off) else float("nan")
 
     @property
@@ -112,29 +112,10 @@ class Fit:
     @property
     def coefficients(self) -> dict[str, dict[str, Any]]:
         """Params by type of module, module or `all`, as `body.coefficients` reads them."""
-        found: dict[str, dict[str, Any]] = {}
-        pairs = zip(self.problem.parameters, self.state.point.free, strict=True)
-        for parameter, offset in pairs:
-            for where, params in parameter.entries(parameter.value(float(offset))).items():
-                own = found.setdefault(where, {})
-                for key, value in params.items():
-                    if key == "factors":
-                        before = own.get(key, {})
-                        own[key] = before | {
-                            k: multiply_factors(_plain(x), before.get(k, 1.0))
-                            for k, x in value.items()
-                        }
-                    elif isinstance(value, dict):
-                        own[key] = own.get(key, {}) | {k: _plain(x) for k, x in value.items()}
-                    elif key == "ballast_position" and key in own:
-                        start = self.problem.robot.morphology.modules
-                        [at] = [m.kind.parts[0].ballast_position for m in start if m.name == where]
-                        own[key] = [
-                            _plain(b) if b != c else a
-                            for a, b, c in zip(own[key], value, at, strict=True)
-                        ]
-                    else:
-                        own[key] = _plain(value)
+        problem = self.problem
+        found: dict[str, dict[str, Any]] = _plain(
+            entries_of(problem.robot, problem.parameters, self.state.point.free)
+        )
         return found
 
     def to_yaml(self) -> str:
@@ -177,6 +158,8 @@ class Fit:
 
 
 def _plain(value: object) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(x) for key, x in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(x) for x in value]
     return round(float(value), 9) if isinstance(value, float) else value
@@ -254,9 +237,8 @@ def conclude(
 
 
 def _predict(problem: FitProblem, state: FitState) -> tuple[Prediction, ...]:
-    before = problem.origin()
-    before = type(before)(before.free, state.point.local, state.point.starts)
-    tracks = problem.simulate([state.point, before])
+    now = [state.point]
+    tracks = np.concatenate([problem.simulate(now), problem.simulate(now, unchanged=True)])
     left = dict(zip(range(len(problem.channels)), problem.residuals(tracks), strict=True))
     found = []
     for r, recording in enumerate(problem.recordings):

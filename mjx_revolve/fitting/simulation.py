@@ -36,6 +36,7 @@ class Drive:
         speeds: of the same hinges [rad/s].
         ctrl: `[K, N, nu, 2, R]` the robot's own order: as given, and a little later.
         later: `[V]` which variants have the later one.
+        begin: `[R]` times of the waves at the start [s].
     """
 
     resets: np.ndarray
@@ -43,6 +44,7 @@ class Drive:
     speeds: np.ndarray
     ctrl: np.ndarray
     later: np.ndarray
+    begin: np.ndarray
 
 
 @lru_cache(maxsize=8)
@@ -52,14 +54,14 @@ def _program(variants: Variants, lanes: int, windows: int, steps: int, every: in
 
     def run(
         numbers: PyTree, roots: PyTree, resets: PyTree, angles: PyTree, speeds: PyTree,
-        ctrl: PyTree, later: PyTree, current: PyTree,
+        ctrl: PyTree, later: PyTree, current: PyTree, begin: PyTree,
     ) -> PyTree:  # fmt: skip
         count = roots.shape[-1]
         wide = lambda x: jnp.broadcast_to(x[..., None, :], (*x.shape[:-1], lanes, x.shape[-1]))  # noqa: E731
         flat = lambda x: x.reshape(*x.shape[:-2], lanes * count)  # noqa: E731
         numbers = [flat(jnp.broadcast_to(x[..., None], (*x.shape, count))) for x in numbers]
         engine = variants.engine(numbers)
-        water = Water(world.surface_height, tuple(flat(current)))
+        water = Water(world.surface_height, tuple(flat(current)), time=flat(wide(begin)))
         rollout = Rollout(engine, open_loop, world, water)
         first = flat(roots[0])
         qpos = jnp.concatenate([first[:7], flat(wide(angles))])
@@ -122,6 +124,6 @@ def simulate_windows(
     with jax.enable_x64(True):
         run = _program(variants, len(robots), windows, steps, every)
         given = (variants.stack(robots), roots, drive.resets, drive.angles, drive.speeds,
-                 drive.ctrl, drive.later, current)  # fmt: skip
+                 drive.ctrl, drive.later, current, drive.begin)  # fmt: skip
         found = np.asarray(run(*given))
     return np.moveaxis(found, (3, 4), (0, 1))

@@ -62,12 +62,19 @@ def _law(describe: Callable[[], str]) -> BeforeValidator:
     return BeforeValidator(check)
 
 
+def _maps(value: Any) -> bool:
+    """Whether a value is a mapping, or the pairs that one was read into."""
+    if isinstance(value, tuple):
+        return all(isinstance(x, tuple) and len(x) == 2 for x in value)
+    return isinstance(value, Mapping)
+
+
 @also({"type": "object", "additionalProperties": {"type": "number"}})
 def _read_coefficients(value: Any) -> Any:
     """A mapping from names to numbers as sorted pairs, each within its coefficient's bounds."""
     if not value:
         return ()
-    if not isinstance(value, Mapping | tuple):
+    if not _maps(value):
         raise ConstraintError("", "a mapping from coefficients to numbers", show(value))
     given, known = dict(value), {c.name: c for _, c in list_coefficients() if not c.own_field}
     for name, number in given.items():
@@ -129,7 +136,7 @@ def _read_factors(value: Any) -> Any:
     """A mapping from names to factors as sorted pairs."""
     if not value:
         return ()
-    if not isinstance(value, Mapping | tuple):
+    if not _maps(value):
         raise ConstraintError("", "a mapping from coefficients to factors", show(value))
     given, known = {**dict(value)}, factor_names()
     for name, factor in given.items():

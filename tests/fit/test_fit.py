@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from experiments.fit_coverage import commands
 from experiments.fit_measured import GLIDE, fit_glide, fit_lamprey, glide_errors, lamprey_ratios
 from mjx_revolve import fit as command
+from mjx_revolve.body.coefficients import correct_modules
 from mjx_revolve.body.morphology import load_morphology, make_morphology, save_morphology
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.variants import course_targets
@@ -36,7 +37,7 @@ from mjx_revolve.fitting.estimate import (
     normal_equations,
 )
 from mjx_revolve.fitting.identify import find_unknown, plan_motions
-from mjx_revolve.fitting.parameters import read_free, with_values
+from mjx_revolve.fitting.parameters import entries_of, read_free, with_values
 from mjx_revolve.fitting.problem import NOISE, make_problem
 from mjx_revolve.fitting.recording import read_map
 from mjx_revolve.fitting.run import FitRun, Request, load_robot
@@ -113,6 +114,68 @@ def test_at_an_end_of_an_interval_the_recordings_fit_worse_by_what_95_percent_al
         cost.append(windows.sum() + rest)
     prior = problem.parameters[0].spread ** -2 * (end**2 - best.free[0] ** 2) / 2
     assert cost[1] + prior - cost[0] == pytest.approx(1.96**2 / 2, rel=0.15)
+
+
+def test_numbers_of_one_thruster_and_of_one_ballast_act_together(auv):
+    """And what the robot states of them stays; in any order, and as the file has it."""
+    names = ["thruster.gain", "thruster_lag", "ballast@core", "ballast_position.x@core",
+             "ballast_position.z@core"]  # fmt: skip
+    offsets = np.array([0.3, 0.2, 0.1, 0.004, 0.005])
+    jets = [auv.morphology.modules[k].kind.parts for k, _ in auv.morphology.thrusters]
+    for order in (slice(None), slice(None, None, -1)):
+        parameters = read_free(names[order], auv)
+        robot = with_values(auv, parameters, offsets[order])
+        core = robot.morphology.modules[0].kind.parts[0]
+        assert core.ballast_mass == pytest.approx(0.03 * np.exp(0.1))
+        assert core.ballast_position == pytest.approx((0.004, 0.0, -0.013))
+        for old, (k, _) in zip(jets, robot.morphology.thrusters, strict=True):
+            now = robot.morphology.modules[k].kind.parts
+            before, after = (next(p.thruster for p in x if p.thruster) for x in (old, now))
+            assert after.gain == pytest.approx(before.gain * np.exp(0.3))
+            assert after.time_constant == pytest.approx(before.time_constant * np.exp(0.2))
+            assert after.torque_ratio == before.torque_ratio != 0
+    entries = entries_of(auv, parameters, offsets[order])
+    again = correct_modules(auv.morphology.modules, entries, "file")
+    assert again == robot.morphology.modules
+
+
+def test_what_changes_nothing_is_refused(auv):
+    recording = RobotRecording("a", {n: TimeSeries(np.arange(3.0), np.zeros(3)) for n in "xyz"})
+    with pytest.raises(InputError, match=r"--free nose_suction: .* changes nothing"):
+        make_problem(auv, [recording], ["nose_suction"], FitSettings())
+
+
+@pytest.mark.parametrize("factor", [2.0, 20.0])
+def test_a_robot_among_variants_moves_as_alone(factor):
+    """Also where the drag is so large that the step's bounds grow."""
+    robot = build_robot(load_morphology("core"), load_world("empty_underwater", timestep=0.02))
+    time = np.arange(0, 1, 0.05)
+    still = dict(x=0.0, y=0.0, z=-1.0, qw=1.0, qx=0.0, qy=0.0, qz=0.0)
+    given = [RobotRecording("a", {n: TimeSeries(time, x + 0 * time) for n, x in still.items()})]
+
+    def track(robot, offset):
+        problem = make_problem(robot, given, ["drag"], FitSettings(window=1.0, held_out=0.0))
+        problem.roots[:, 7:] = np.array([1.0, 0.3, 0.0, 0.0, 0.0, 3.0])[:, None]
+        return problem.simulate([replace(problem.origin(), free=np.array([offset]))])
+
+    offset = np.log(factor)
+    alone = with_values(robot, read_free(["drag"], robot), np.array([offset]))
+    np.testing.assert_allclose(track(robot, offset), track(alone, 0.0), atol=1e-12)
+
+
+def test_waves_are_where_they_were_when_the_recording_began():
+    """Two that begin half a period apart are moved by opposite waves."""
+    sea = load_world("empty_underwater", timestep=0.01, waves=[{"amplitude": 0.02, "period": 1.0}])
+    robot, time = build_robot(load_morphology("core"), sea), np.arange(0, 1, 0.05)
+    still = dict(x=0.0, y=0.0, z=-0.5, qw=1.0, qx=0.0, qy=0.0, qz=0.0)
+    given = [
+        RobotRecording(str(t), {n: TimeSeries(time + t, x + 0 * time) for n, x in still.items()})
+        for t in (0.0, 0.5, 1.0)
+    ]
+    problem = make_problem(robot, given, ["drag"], FitSettings(window=1.0, held_out=0.0))
+    rising = problem.simulate([problem.origin()])[0, :, 0, -1, 9]
+    assert abs(rising[0] - rising[1]) > 0.01
+    assert rising[2] == pytest.approx(rising[0], rel=1e-6)
 
 
 def test_windows_are_cut_in_their_middles_and_never_where_nothing_is_fitted():
@@ -378,6 +441,12 @@ def test_errors_are_of_what_was_recorded():
     fit = Prediction("swim", np.arange(3.0), none, found, found + 0.1, found)
     assert fit.error(fit.fitted, False) == pytest.approx(0.1 * np.sqrt(3))
     assert fit.error(fit.before, False) == 0 and np.isnan(fit.error(fit.fitted, True))
+    # What has no simulated value, such as the beginning of a mean speed, is no hit.
+    half = found + 0.1
+    half[0] = np.nan
+    whole = np.full((3, 3), 0.2)
+    fit = Prediction("swim", np.arange(3.0), none, whole, np.vstack([half[:1], whole[1:] + 0.1]), 0)
+    assert fit.error(fit.fitted, False) == pytest.approx(0.1 * np.sqrt(3))
 
 
 def test_names_of_modules_may_end_like_units(tmp_path):
