@@ -7,6 +7,7 @@ from typing import Any
 
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import Morphology, make_morphology
+from mjx_revolve.body.placement import GROWN_TOLERANCE, find_overlaps
 from mjx_revolve.inputs.errors import InputError
 
 
@@ -32,10 +33,14 @@ def random_body(seed: int, hinges: int, bricks: int | None = None) -> Morphology
         turn = draw.choice([0, 90, 180, 270])
         parent.setdefault("children", {})[slot] = {"type": left[-1], "orientation": turn}
         try:
-            found = make_morphology(_in_order(root), name=f"random_{seed}")
-            left.pop()
+            grown = make_morphology(_in_order(root), name=f"random_{seed}")
         except InputError:  # it would overlap
+            grown = None
+        if grown is None or find_overlaps(grown.modules, tolerance=GROWN_TOLERANCE):
             del parent["children"][slot]
+        else:
+            found = grown
+            left.pop()
     return found
 
 

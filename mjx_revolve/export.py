@@ -20,6 +20,7 @@ from mjx_revolve.inputs.commands import (
     add_episode_arguments,
     check_absent,
     check_episode_path,
+    check_output_folder,
     check_place,
     individual_name,
     program,
@@ -100,11 +101,8 @@ def _named_files(arguments: argparse.Namespace) -> dict[str, Path]:
         return files
     if files:
         raise InputError(f"--out: expected a folder or single files; found --{next(iter(files))}")
-    folder = Path(arguments.out)
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"--out {folder}: expected a folder; found a file")
-    check_place(folder / "any", f"--out {folder}")
-    return _all_files(folder)
+    check_output_folder(arguments.out)
+    return _all_files(Path(arguments.out))
 
 
 def _check_importable(path: Path, label: str) -> None:
@@ -131,6 +129,10 @@ def main(argv: list[str] | None = None) -> int:
     """
     arguments = _parser().parse_args(argv)
     files = _named_files(arguments)
+    if files and arguments.meshes is not None and files.keys().isdisjoint(("urdf", "sdf")):
+        raise InputError("--meshes: expected --urdf, --sdf or all formats; found neither")
+    if not files and Path(arguments.path).is_dir():
+        check_place(Path(arguments.path) / "any", arguments.path)
     check_episode_path(arguments.path)
     runtime.fix_threads()
     from mjx_revolve.episodes.early_checks import check_episode_files

@@ -9,7 +9,14 @@ from __future__ import annotations
 
 import sys
 
-from mjx_revolve.inputs.commands import Parser, check_absent, program, read_path, run_command
+from mjx_revolve.inputs.commands import (
+    Parser,
+    check_absent,
+    check_output_folder,
+    program,
+    read_path,
+    run_command,
+)
 from mjx_revolve.inputs.files import read_file, short_path
 
 
@@ -41,6 +48,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     arguments = parser.parse_args(argv)
     read_file(arguments.file, 1)  # it is there
+    check_output_folder(arguments.out or ".", "--out" if arguments.out else "")
     # MuJoCo takes a second to import: not for `--help`.
     from mjx_revolve.formats.import_robot import import_robot
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from mjx_revolve.inputs.commands import Parser, program, read_path, run_command
+from mjx_revolve.inputs.commands import Parser, check_place, program, read_path, run_command
 from mjx_revolve.inputs.files import short_path, write_atomic
 from mjx_revolve.inputs.trust import add_trust_argument, opening
 from mjx_revolve.numerics import runtime
@@ -55,6 +55,7 @@ def _judge(arguments: argparse.Namespace) -> int:
     config = champion.load_config()
     fitness = make_fitness(config)
     champion.check_genes(fitness.num_genes, "config.yaml")
+    check_place(folder / PASSPORT, short_path(folder))
     passport = make_passport(fitness, champion.genes, config.evolution.seed)
     widths = [max(len(row[k]) for row in passport.rows) for k in range(3)]
     for row in passport.rows:

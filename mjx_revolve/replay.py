@@ -229,7 +229,11 @@ def main(argv: list[str] | None = None) -> int:
 
 def _ancestor_films(arguments: argparse.Namespace, folder: Path | None) -> list[Film]:
     """Films of an individual and its ancestors, the oldest first."""
-    from mjx_revolve.episodes.champion import champion_number, load_individuals
+    from mjx_revolve.episodes.champion import (
+        champion_number,
+        load_individuals,
+        read_individuals,
+    )
     from mjx_revolve.episodes.early_checks import refuse_world
     from mjx_revolve.view.film.film import make_film
     from mjx_revolve.view.population import pick_ancestors, read_population
@@ -239,6 +243,7 @@ def _ancestor_films(arguments: argparse.Namespace, folder: Path | None) -> list[
     if folder is None:
         raise InputError(f"{arguments.path}: expected a run folder, for --ancestors; found none")
     number = arguments.individual
+    read_individuals(folder, [])  # refuses runs in which no bodies evolve
     number = champion_number(folder) if number is None else number
     family = pick_ancestors(read_population(folder)[0], number, arguments.ancestors)
     numbers = [one.number for one in family] or [number]

@@ -13,7 +13,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from mjx_revolve.inputs.commands import Parser, program, read_path, run_command
+from mjx_revolve.inputs.commands import Parser, check_place, program, read_path, run_command
 from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import PAGES, SWEEP, check_name, short_path, write_atomic
 from mjx_revolve.inputs.trust import add_trust_argument, opening
@@ -66,10 +66,13 @@ def _named_page(arguments: argparse.Namespace, usual: Path) -> Path:
     from mjx_revolve.view.report.page import default_page
 
     if arguments.out is None:
-        return default_page(usual)
+        path = default_page(usual)
+        check_place(path, str(path))
+        return path
     path = check_name(arguments.out, PAGES, f"--out {arguments.out}")
     if not path.parent.is_dir():
         raise InputError(f"--out {path}: expected the folder {path.parent}; found none")
+    check_place(path, f"--out {path}")
     return path
 
 
@@ -86,7 +89,7 @@ def _report_sweep(sweep: str, arguments: argparse.Namespace) -> int:
     ):  # fmt: skip
         if value:
             raise InputError(f"--{option}: expected run folders; found the sweep {sweep}")
-    report = write_report(sweep, arguments.out and _named_page(arguments, Path(sweep)))
+    report = write_report(sweep, _named_page(arguments, Path(sweep)))
     for line in report.lost:
         print(f"warning: {line}", file=sys.stderr)
     print(f"report: {short_path(report.page)}; {short_path(report.table)}")

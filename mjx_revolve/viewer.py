@@ -65,6 +65,8 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     if arguments.out is not None:
         check_place(check_name(arguments.out, PAGES), arguments.out)
+    elif Path(arguments.path).is_dir():
+        check_place(Path(arguments.path) / "any", arguments.path)
     check_episode_path(arguments.path)
     check_colony_arguments(arguments)
     if arguments.colony:

@@ -134,7 +134,7 @@ def load_episode(
         morphology = trim_neutral(morphology, water.density)
     robot = build_robot(morphology, water)
     key = None if seed is None else jax.random.key(seed)
-    seconds, gusty = duration or _SECONDS, None
+    seconds, gusty = _SECONDS if duration is None else duration, None
     if water.gust is not None:
         steps = max(1, round(seconds / water.timestep))
         gusts = draw_gusts(water, jax.random.key(seed or 0), steps, 1)

@@ -31,7 +31,7 @@ from mjx_revolve.evolution.progress import is_live
 from mjx_revolve.evolution.run import MakeExecutor, Run, check_search, check_unchanged
 from mjx_revolve.evolution.run_folder import RunFolder, is_new_folder, open_run_folder
 from mjx_revolve.evolution.tensorboard import check_tensorboard
-from mjx_revolve.inputs.commands import check_place, describe_refusal
+from mjx_revolve.inputs.commands import check_output_folder, describe_refusal
 from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.files import SWEEP, short_path, write_atomic
 from mjx_revolve.inputs.grids import MOST_SEEDS, combine, read_axes
@@ -191,13 +191,11 @@ def read_sweep(folder: str | Path) -> Sweep:
 
 def check_folder(folder: Path) -> None:
     """Raises `InputError` for a folder that is not new, empty or a sweep's; see `next_step`."""
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"--out {folder}: expected a folder; found a file")
+    check_output_folder(folder)
     if not (folder / SWEEP).is_file() and folder.is_dir() and any(folder.iterdir()):
         raise InputError(
             f"--out {folder}: expected a new or empty folder, or that of a sweep; found files"
         )
-    check_place(folder / SWEEP, f"--out {folder}")
 
 
 def write_sweep(folder: Path, sweep: Sweep) -> None:

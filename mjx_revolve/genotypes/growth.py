@@ -10,7 +10,7 @@ import numpy as np
 
 from mjx_revolve.body.boxes import boxes_overlap
 from mjx_revolve.body.module_types import ModuleType
-from mjx_revolve.body.placement import OVERLAP_TOLERANCE, Module, attach, frozen
+from mjx_revolve.body.placement import GROWN_TOLERANCE, Module, attach, frozen
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.genotypes.genotype import SLACK, Space
 
@@ -243,7 +243,7 @@ def _shape(same: _Same, turn: bytes) -> _Shape:
     reach = np.abs(rotation).T
     center = np.array([part.position for part in parts])
     half = np.array([part.boxes[0].size for part in parts]) / 2
-    half = half - np.minimum(OVERLAP_TOLERANCE, half / 2)
+    half = half - np.minimum(GROWN_TOLERANCE, half / 2)
     boxes = [(part.position, box) for part in parts for box in part.boxes]
     middle = np.array([np.add(place, box.position) for place, box in boxes]) @ rotation.T
     whole = np.array([box.size for _, box in boxes]) / 2 @ reach

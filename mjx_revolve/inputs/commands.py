@@ -241,6 +241,14 @@ def check_place(path: str | Path, label: str) -> None:
             raise InputError(f"{label}: expected the folder {folder}; found a file")
 
 
+def check_output_folder(folder: str | Path, option: str = "--out") -> None:
+    """Raises `InputError` if no files can be written into a folder, before any work is done."""
+    label = f"{option} {folder}".lstrip()
+    if Path(folder).exists() and not Path(folder).is_dir():
+        raise InputError(f"{label}: expected a folder; found a file")
+    check_place(Path(folder) / "any", label)
+
+
 def check_absent(path: Path, what: str = "file") -> None:
     """Raises `InputError` if a file exists at a path: a user's file is never overwritten."""
     if path.exists():

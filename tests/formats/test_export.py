@@ -113,6 +113,10 @@ WRONG = [
     (["a.yaml", "--out", "b", "--sdf", "a.sdf"], "--out: expected a folder or single files; found"),
     (["a.yaml", "--duration", "nan"], "--duration: expected a number > 0 and <= 86400 [s]; found"),
     (["a.yaml", "--mjcf", "file/a.xml"], "--mjcf file/a.xml: expected the folder file; found a"),
+    (
+        ["a.yaml", "--mjcf", "a.xml", "--meshes", "x/"],
+        "--meshes: expected --urdf, --sdf or all formats; found neither",
+    ),
     (["run", "--world", "lake"], "world: expected none: a champion swims in the world it evolved"),
 ]
 

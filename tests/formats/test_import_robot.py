@@ -226,6 +226,8 @@ def test_the_command_writes_what_other_commands_read(tmp_path, capsys, monkeypat
     assert main([str(path)]) == 0
     with pytest.raises(InputError, match=r"two_legs\.yaml: expected no such file yet"):
         main([str(path)])
+    with pytest.raises(InputError, match=r"--out robot\.urdf: expected a folder; found a file"):
+        main([str(path), "--out", "robot.urdf"])
 
 
 @pytest.mark.parametrize(

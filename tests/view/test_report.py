@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -23,7 +24,7 @@ from mjx_revolve.view.report import page as report_page
 from mjx_revolve.view.report import repeat as report_repeat
 from mjx_revolve.view.report.champion import replay_champion
 from mjx_revolve.view.report.data import read_run
-from mjx_revolve.view.report.groups import differences, group_runs
+from mjx_revolve.view.report.groups import differences, group_runs, setting_words
 from mjx_revolve.view.statistics import interval
 
 SETTINGS = {
@@ -237,6 +238,23 @@ def test_the_replay_scores_as_evolution_did(lab, copy):
     assert np.isnan(replay_champion(record, lab["fitness"]).score) == 0
     assert "changed" in record.state
     assert "the simulator has changed since, or files of the run have" in record.warning
+
+
+def test_one_episode_may_differ_more_than_the_means_of_several(lab, copy):
+    """What runs record is the deviation of means over `task.trials` episodes."""
+    edit(copy / "config.yaml", "trials: 1", "trials: 16")
+    record = read_run(copy)
+    for std, changed in ((0.006, False), (0.004, True)):
+        scores = {"score": lab["score"] + 0.1, "score_std": std}
+        off = replace(record, champion=record.champion | scores, problems=[])
+        replay_champion(off, lab["fitness"])
+        assert ("changed" in off.state) == changed
+
+
+def test_names_of_robots_may_hold_dots_and_blanks():
+    assert setting_words("morphology", "spider_v0.1 abc123") == "spider_v0.1"
+    assert setting_words("morphology", "big fish 00ff00") == "big fish"
+    assert setting_words("morphology", "robots/big.fish.yaml") == "big.fish"
 
 
 def axes_of(figure):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import jax
@@ -17,7 +18,7 @@ from mjx_revolve.view.sensor_log import SensorTrace, trace_sensors
 from mjx_revolve.view.surroundings import target_at_last
 
 # A replay with a score further than this from the recorded mean counts as another episode: standard
-# deviations over the fresh starts, and a share of the score itself if those hardly differ.
+# deviations of single episodes, and a share of the score itself if those hardly differ.
 _DEVIATIONS, _SHARE = 5.0, 0.05
 
 
@@ -81,7 +82,9 @@ def _compare(record: RunRecord, score: float) -> None:
     mean, std = (number(record.champion.get(name)) for name in ("score", "score_std"))
     if mean is None or std is None or not record.is_finished:
         return
-    allowed = max(_DEVIATIONS * std, _SHARE * abs(mean))
+    # What is recorded is the deviation of means over so many episodes.
+    single = std * math.sqrt(record.trials)
+    allowed = max(_DEVIATIONS * single, _SHARE * abs(mean))
     if not abs(score - mean) <= allowed:
         record.note(
             "changed",

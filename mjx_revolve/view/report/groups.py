@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -195,7 +196,8 @@ def setting_words(key: str, value: object) -> str:
         return ""
     section, _, leaf = key.rpartition(".")
     if key in ("morphology", "modules", "world.name"):
-        return Path(str(value).split(" ")[0]).stem
+        named = re.fullmatch(r"(.*) (?:[0-9a-f]{6})?", str(value))  # of `by_content`
+        return named[1] if named else Path(str(value)).stem
     if leaf in ("type", "strategy") and section:
         return str(value).split(" ")[0]
     if leaf == "generations":

@@ -165,6 +165,11 @@ class RunRecord:
         return found if isinstance(found, int) and found in known else None
 
     @property
+    def trials(self) -> int:
+        """Episodes of each start; 1 where that is not known."""
+        return 1 if self.config is None else self.config.task.trials
+
+    @property
     def is_finished(self) -> bool:
         """Whether its champion was evaluated on fresh starts."""
         return "finished" in self.info and number(self.champion.get("score")) is not None

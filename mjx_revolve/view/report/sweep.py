@@ -146,7 +146,7 @@ def make_report(
     content += [
         ("bodies", "Bodies", _bodies(numbered)),
         ("runs", "Runs", _runs(plans, outcomes, named, folder, at)),
-        ("repeat", "Repeat it", sections.sweep_repeat(_command(sweep), settings)),
+        ("repeat", "Repeat it", sections.sweep_repeat(_command(sweep, folder), settings)),
     ]
     lead = sections.headline([
         (f"{len(outcomes)} of {len(plans)}", "runs finished"),
@@ -166,8 +166,9 @@ def case_words(sweep: Sweep, case: str) -> str:
     return "; ".join(setting_words(*pair) for pair in words if pair[0] in varied) or case
 
 
-def _command(sweep: Sweep) -> str:
+def _command(sweep: Sweep, folder: Path) -> str:
     words = ["python", "-m", "mjx_revolve.sweep", sweep.config, "--seeds", str(sweep.seeds)]
+    words += ["--out", short_path(folder)]
     words += ["--first-seed", str(sweep.first_seed)] if sweep.first_seed else []
     for setting in sweep.settings:
         words += ["--set", setting]

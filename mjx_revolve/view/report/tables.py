@@ -92,6 +92,7 @@ def _of_run(record: RunRecord, unit: str) -> list[tuple[str, str]]:
     pairs = []
     if record.is_finished:
         starts = f"mean ± standard deviation over {REPORT_EPISODES} fresh starts"
+        starts += f", each of {record.trials} episodes" if record.trials > 1 else ""
         mark = record.passport.mark if record.passport is not None else ""
         starts += f"; {_FAILS} {mark}" if mark else ""
         pairs.append((_score(record), f"score{unit}, {starts}"))
