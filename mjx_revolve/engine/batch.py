@@ -22,6 +22,7 @@ from mjx_revolve.engine.assembly import FRICTION, Assembly, assemble
 from mjx_revolve.engine.level import Level, PartLaws, Parts, Thrusters
 from mjx_revolve.engine.plant import BodyGeometry, Plant, body_geometries, read_actuators
 from mjx_revolve.engine.robot import Robot
+from mjx_revolve.engine.self_pairs import rest_overlaps
 from mjx_revolve.engine.sites import place_types
 from mjx_revolve.engine.step_constants import (
     LIMIT_OVERSHOOT,
@@ -128,6 +129,7 @@ class PackedBodies(NamedTuple):
         figure: `[P]` each.
         first: `[meetings, P]` of pairs of boxes that can meet, see `Meetings`, int32.
         second: the other box of each pair.
+        rest: by how much they overlap at rest [m].
     """
 
     root: Any
@@ -143,6 +145,7 @@ class PackedBodies(NamedTuple):
     figure: BodyGeometry
     first: Any
     second: Any
+    rest: Any
 
     @property
     def alike(self) -> bool:
@@ -561,8 +564,11 @@ def _pick_rows(
     capacity: Capacity,
     order: RowOrder,
     pairs: np.ndarray,
-) -> tuple[Level, Level, np.ndarray]:
-    """Roots `[1, R]` and rows `[rows, 1, R]` of R robots; `[2, meetings, R]` pairs of shells."""
+) -> tuple[Level, Level, np.ndarray, np.ndarray]:
+    """Roots `[1, R]` and rows `[rows, 1, R]` of R robots; `[2, meetings, R]` pairs of shells.
+
+    And `[meetings, R]` by how much these overlap at rest [m].
+    """
     count, rows = len(assembly.roots), capacity.rows
     whole = np.zeros((rows, count), int)
     whole[order.place, order.robot] = order.body
@@ -603,6 +609,7 @@ def _pick_rows(
         root_points = root_points if capacity.root_points else None
     shells = root_shells = None
     met = np.zeros((2, capacity.meetings, count), int)
+    rest = np.zeros((capacity.meetings, count))
     if capacity.shells or capacity.root_shells:
         part, held, piece, rank = _shell_places(order, assembly, pairs)
         every = np.ones(len(held), bool)
@@ -615,6 +622,7 @@ def _pick_rows(
         ends = np.searchsorted(part, pairs)
         owner = assembly.robot[held[ends[:, 0]]] if len(pairs) else np.zeros(0, int)
         met[:, _ranks(owner), owner] = number[ends].T
+        rest[_ranks(owner), owner] = rest_overlaps(assembly, pairs)
         blank = np.append(part, len(assembly.fluid.volume))
         shells = blank[in_rows] if most[0] else None
         root_shells = blank[in_roots] if most[1] else None
@@ -624,7 +632,7 @@ def _pick_rows(
         alike, assembly.roots, root_parts, root_points, root_shells, True, 1, finish
     )
     level = select_bodies(alike, body, parts, points, shells, False, 1, finish, whole)
-    return root, level, met
+    return root, level, met, rest
 
 
 def _alike(columns: StepConstants, nothing: Parts) -> StepConstants:
@@ -665,7 +673,7 @@ def pack_bodies(
     order = order_rows(assembly, columns, capacity.groups)
     _check_fit(assembly, columns, order, capacity)
     _check_shells(assembly, order, pairs, capacity)
-    root, level, met = _pick_rows(assembly, columns, capacity, order, pairs)
+    root, level, met, rest = _pick_rows(assembly, columns, capacity, order, pairs)
     names = [str(body.name) for body in assembly.morphologies]
     real = np.zeros((capacity.rows, 1, len(names)), bool)
     real[order.place, 0, order.robot] = ~order.overflow
@@ -691,6 +699,7 @@ def pack_bodies(
             figure=figures,
             first=met[0],
             second=met[1],
+            rest=rest,
             **hanging,
         ),
     )

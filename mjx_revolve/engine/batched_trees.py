@@ -433,8 +433,7 @@ def make_batched_trees(
             np.zeros(capacity.root_shells, int),
             np.repeat(np.arange(1, capacity.rows + 1), capacity.shells),
         )
-        first, second = bodies.first, bodies.second
-        met = Meetings.of(boxes, body, first, second, steady)
+        met = Meetings.of(boxes, body, bodies.first, bodies.second, bodies.rest, steady)
     return BatchedTrees(world, capacity, bodies, lanes, stack_indices, table, count, met)
 
 

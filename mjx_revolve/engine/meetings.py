@@ -73,6 +73,7 @@ class Meetings(NamedTuple):
         body: `[nshell]` the body of each: 0 is the root, k + 1 the tree's row k; NumPy's.
         first: the one box of each pair, int32.
         second: the other box; the same one for padding, which stands behind all pairs.
+        rest: by how much the boxes of each pair overlap at rest [m].
         count: `[lanes]` or `[1]` how many pairs a robot has, int32.
         steady: whether loops are to have a known length, so that they have derivatives.
         halves: `[nshell, 5]` the module of each, the way to its right and its middle along that
@@ -84,6 +85,7 @@ class Meetings(NamedTuple):
     body: np.ndarray
     first: Any
     second: Any
+    rest: Any
     count: Any
     steady: bool
     halves: np.ndarray | None = None
@@ -94,6 +96,7 @@ class Meetings(NamedTuple):
         body: np.ndarray,
         first: Any,
         second: Any,
+        rest: Any,
         steady: bool,
         halves: np.ndarray | None = None,
     ) -> Meetings:
@@ -101,4 +104,4 @@ class Meetings(NamedTuple):
         radius = jnp.sqrt(dot(boxes.half_size, boxes.half_size))
         count = (first != second).sum(0).astype(np.int32)
         shapes = jnp.stack([x.reshape(-1) for x in (*jax.tree.leaves(boxes), radius)])
-        return Meetings(radius.shape[1], shapes, body, first, second, count, steady, halves)
+        return Meetings(radius.shape[1], shapes, body, first, second, rest, count, steady, halves)

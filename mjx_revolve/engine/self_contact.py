@@ -59,8 +59,8 @@ _WORD = 32
 _FAR = 1e3
 # What no contact needs, and what stands for the need of those that push already [m/s²].
 _NONE, _KEPT = -1e9, 1e9
-# Overlap that is tolerated [m], the share of the rest that is removed in a step, and the top speed
-# of that [m/s]. Choices.
+# Overlap that is tolerated [m], also where there is none at rest, the share of the rest that is
+# removed in a step, and the top speed of that [m/s]. Choices.
 _SLOP, _SHARE, _TOP = 5e-4, 1.0, 1.0
 # Rounds in which contacts are looked for, and by how much those of one round must turn a hinge for
 # a further one [rad]. Choices: 0.2 degrees move the end of a limb by .3 mm.
@@ -346,6 +346,7 @@ def _find_contacts(
         jnp.asarray(meetings.halves.T, dtype) if halves and meetings.halves is not None else None
     )
     pairs = [jnp.asarray(x, jnp.int32).reshape(-1) for x in (meetings.first, meetings.second)]
+    at_rest = jnp.asarray(meetings.rest, dtype).reshape(-1)
 
     def flat(k: jax.Array, lane: jax.Array, lanes: int) -> jax.Array:
         return k if lanes == 1 else k * lanes + take_lanes(which, lane)
@@ -385,23 +386,25 @@ def _find_contacts(
         numbers, count = listed
 
         def measure(k: Any, table: ContactTable) -> ContactTable:
-            given = look_up(jax.lax.dynamic_slice(numbers, (k * _PAIRS,), (_PAIRS,)))
+            number = jax.lax.dynamic_slice(numbers, (k * _PAIRS,), (_PAIRS,))
+            given = look_up(number)
+            rest = take_lanes(at_rest, flat(number // size, number % size, lanes))
             shown = tuple(
                 (pick(frames, x.body * size + x.lane), pick(shapes[:-1], x.number)) for x in given
             )
-            need, gap, *units = _measure(shown, dt)
+            need, gap, *units = _measure(shown, rest, dt)
             found = [*(x.body.astype(dtype) for x in given), *units]
             if cells is not None:
                 tables = [pick(cells, x.shell) for x in given]
                 ahead = [frame[12:] for frame, _ in shown]
                 found += [_half(*x, units[3:]) for x in zip(tables, ahead, strict=True)]
-            rest = jnp.stack(found)
+            numbers_of = jnp.stack(found)
             left = count - k * _PAIRS
             if steady:
                 listed = jnp.arange(_PAIRS, dtype=jnp.int32) < left
                 need, gap = jnp.where(listed, need, _NONE), jnp.where(listed, gap, _FAR)
             left = _PAIRS if steady else jnp.minimum(left, _PAIRS)
-            return _insert(table, left, (need, gap, rest), given[0].lane)
+            return _insert(table, left, (need, gap, numbers_of), given[0].lane)
 
         return _repeat(-(-count // _PAIRS), -(-npair * size // _PAIRS), measure, table, steady)
 
@@ -462,7 +465,8 @@ def _find_at_once(
         return jnp.take_along_axis(wide, row[None], 1).reshape(len(table), -1)
 
     shown = tuple((pick(frames, body[x]), pick(shapes, x)) for x in pairs)
-    need, gap, *units = _measure(shown, dt)
+    at_rest = jnp.broadcast_to(jnp.asarray(meetings.rest, dtype), (npair, size)).reshape(-1)
+    need, gap, *units = _measure(shown, at_rest, dt)
     found = [*(body[x].reshape(-1).astype(dtype) for x in pairs), *units]
     if halves:
         none = np.zeros((len(meetings.body), 5)) if meetings.halves is None else meetings.halves
@@ -527,10 +531,10 @@ def _placed(frames: jax.Array, shape: jax.Array) -> list[tuple[jax.Array, jax.Ar
     return found
 
 
-def _measure(given: tuple[tuple[jax.Array, jax.Array], ...], dt: float) -> Any:
+def _measure(given: tuple[tuple[jax.Array, jax.Array], ...], at_rest: jax.Array, dt: float) -> Any:
     """What pairs need, their gaps, normals and points; see `ContactTable`."""
 
-    def compute(given: Any) -> Any:
+    def compute(given: Any, at_rest: jax.Array) -> Any:
         halves = [shape[-3:] for _, shape in given]
         boxes = list(zip(*(_placed(*x) for x in given), strict=True))
         pair, later = (
@@ -538,13 +542,14 @@ def _measure(given: tuple[tuple[jax.Array, jax.Array], ...], dt: float) -> Any:
         )
         contact = box_contact(pair, later)
         closing = jnp.maximum(contact.start - contact.gap, 0)
-        parted = jnp.clip(-_SHARE * (contact.start + _SLOP), 0, dt * _TOP)
+        tolerated = jnp.maximum(at_rest, _SLOP)
+        parted = jnp.clip(-_SHARE * (contact.start + tolerated), 0, dt * _TOP)
         target = jnp.minimum(contact.start, 0) + jnp.minimum(parted, closing)
         need = (target - contact.gap) / dt**2
         point = boxes[1][0][1] + contact.point
         return need, contact.gap, *contact.normal, *point
 
-    return fuse(compute)(given)
+    return fuse(compute)(given, at_rest)
 
 
 def _half(cells: jax.Array, ahead: jax.Array, point: list[jax.Array]) -> jax.Array:

@@ -89,6 +89,11 @@ def part_gaps(assembly: Assembly, pairs: np.ndarray) -> Float[np.ndarray, " pair
     return box_gap(pair_of(center[i], rotation[i], half[i], center[j], rotation[j], half[j]))
 
 
+def rest_overlaps(assembly: Assembly, pairs: np.ndarray) -> Float[np.ndarray, " pairs"]:
+    """By how much pairs of parts overlap at rest [m]; 0 where they do not."""
+    return np.maximum(-part_gaps(assembly, pairs), 0.0) if len(pairs) else np.zeros(0)
+
+
 def _ancestry(parent: np.ndarray) -> np.ndarray:
     """`[nbody, nbody]` whether the second body is the first or carries it."""
     found = np.eye(len(parent), dtype=bool)

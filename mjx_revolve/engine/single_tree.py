@@ -21,6 +21,7 @@ from mjx_revolve.engine.edited_model import edited_constants
 from mjx_revolve.engine.level import Level, PartLaws, Thrusters
 from mjx_revolve.engine.meetings import Boxes, Meetings
 from mjx_revolve.engine.robot import Robot
+from mjx_revolve.engine.self_pairs import rest_overlaps
 from mjx_revolve.engine.step_constants import StepConstants, read_constants, select_bodies
 from mjx_revolve.engine.thrusters import read_thrusters
 from mjx_revolve.engine.variation import Variation, vary_level, vary_thrusters
@@ -50,6 +51,7 @@ class SingleTree:
         shells: the body of each box that can meet others, level after level, as `Meetings.body`.
         halves: of these boxes, as `Meetings.halves`.
         pairs: `[npair, 2]` boxes that can meet, int32.
+        rest: `[npair]` by how much they overlap at rest [m].
         robot: the source.
     """
 
@@ -67,6 +69,7 @@ class SingleTree:
     shells: np.ndarray
     halves: np.ndarray
     pairs: np.ndarray
+    rest: np.ndarray
     robot: Robot
 
     @property
@@ -83,7 +86,7 @@ class SingleTree:
         """Which boxes can meet, level after level."""
         first, second = self.pairs.T[..., None]
         boxes = Boxes.of(self.all, like.dtype)
-        return Meetings.of(boxes, self.shells, first, second, True, self.halves)
+        return Meetings.of(boxes, self.shells, first, second, self.rest[:, None], True, self.halves)
 
     @property
     def touches(self) -> bool:
@@ -273,6 +276,7 @@ def make_single_tree(robot: Robot, contact: bool = True) -> SingleTree:
         thrusters=read_thrusters(assembly, robot.num_thrusters),
         carries=columns.parts.carried is not None,
         **_find_meetings(pairs, [rows for *_, rows in made], assembly, columns.frame),
+        rest=rest_overlaps(assembly, pairs),
         robot=robot,
     )
 

@@ -38,13 +38,14 @@ def measure(track: Track, names: Iterable[str] = ()) -> dict[str, jax.Array]:
     Returns:
         `[lanes]` each, by name, units as in `MEASURES`. Always:
 
-        - `displacement_m` distance between the core's first and last place; `speed_m_s` the same
+        - `displacement_m` distance between the first and last place of the robot's point, by
+          default its centre of mass (`task.point`); `speed_m_s` the same
           over time, so over ground, `speed_bl_s` in body lengths;
-        - `path_length_m` length of the core's path, `path_speed_m_s` the same over time;
+        - `path_length_m` length of its path, `path_speed_m_s` the same over time;
         - `straightness` displacement over path length;
         - `energy_j` work of the servos, summed without sign;
         - `cost_of_transport` energy over weight in air times displacement;
-        - `depth_m` mean depth of the core, `depth_error_m` root mean square distance from the
+        - `depth_m` its mean depth, `depth_error_m` root mean square distance from the
           start's depth.
 
         By name, from the water: see `_through_water`; from joints: see `_gait`; from the core: see
@@ -79,7 +80,7 @@ def measure(track: Track, names: Iterable[str] = ()) -> dict[str, jax.Array]:
 
 
 def _through_water(track: Track) -> dict[str, jax.Array]:
-    """`water_speed_m_s`: net way through the water around the core, over time: drift is none."""
+    """`water_speed_m_s`: net way through the water around the robot, over time: drift is none."""
     net = jnp.sum(moved_through_water(track), 0)
     return {"water_speed_m_s": safe_norm(tuple(net)) / track.duration}
 

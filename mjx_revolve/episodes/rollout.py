@@ -38,7 +38,7 @@ class RolloutState(NamedTuple):
         controller_state: of the policy.
         memory: of the sensors.
         energy: work since the last record [J].
-        steps: since the first one; time is exact however long the rollout.
+        steps: since the first one, exact; times in float32 resolve 5 ms for half a day.
     """
 
     state: PyTree

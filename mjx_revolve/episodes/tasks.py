@@ -158,7 +158,7 @@ class Task:
         start: start position of episodes, like `start_at_depth`.
         on_bed: whether episodes begin on the bed, so that there must be one.
         measure: the measure that reports show beside the score.
-        point: the point of `Track.position`, as in `task.point`.
+        point: the point of `Track.position`; that of `task.point`, whatever is given here.
     """
 
     score: Callable[[Track, TaskConfig], jax.Array]

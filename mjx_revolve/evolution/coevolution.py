@@ -55,7 +55,7 @@ class BodySearch:
 
     Attributes:
         generation: number of finished generations; the first one is random, or of seeds.
-        living: the population, best first.
+        living: the population, best first; of an archive, by number.
         elites: those with the best scores of all times, best first, `NUM_ELITES` at most.
         archive: the best of each kind, or None.
         archived: `{number: individual}` of those in the archive.

@@ -19,11 +19,13 @@ from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.engines import make_engine
+from mjx_revolve.engine.kinematics import body_poses
 from mjx_revolve.engine.population import PopulationEngine, make_population_engine
 from mjx_revolve.engine.robot import build_robot, check_timestep
 from mjx_revolve.engine.self_overlap import self_overlap
-from mjx_revolve.engine.self_pairs import candidate_pairs
+from mjx_revolve.engine.self_pairs import candidate_pairs, part_gaps
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics.boxes import box_gap, pair_of
 from mjx_revolve.water.flow import water_of
 
 INWARDS = np.array([[0.785], [-0.785]])
@@ -328,6 +330,42 @@ def test_different_bodies_that_are_looked_at_all_at_once_feel_the_same(other_bac
     for k, robot in enumerate(robots):
         own = found[:, : 7 + robot.num_hinges, 4 * k : 4 * k + 4]
         assert depths(robot, own).max() < 3e-3
+
+
+@pytest.mark.parametrize("seed", [23, 63, 77, 101, 166, 197])
+def test_boxes_that_overlap_by_millimetres_at_rest_are_in_contact_and_end_hinges(seed):
+    """All pairs of modules that are not attached, in poses within the hinges' limits."""
+    robot = build_robot(random_body(seed, 3 + seed % 6, 3 + seed % 6), water())
+    assembly, table = robot.assembly, robot.fluid
+    body, above = table.body, [m.parent for m in robot.morphology.modules]
+    pairs = np.array(
+        [
+            (i, j)
+            for i, j in itertools.combinations(range(len(body)), 2)
+            if body[i] != body[j]
+            and (one := table.module[i]) != (other := table.module[j])
+            and above[one] != other
+            and above[other] != one
+        ]
+    )
+    rest = part_gaps(assembly, pairs)
+    assert (rest < -1e-4).any() and not robot.morphology.overlaps
+    beside = (assembly.parent[body[pairs]] == body[pairs][:, ::-1]).any(1)
+    listed = {tuple(pair) for pair in candidate_pairs(assembly).tolist()}
+    assert {tuple(pair) for pair in pairs[~beside].tolist()} <= listed
+    stops = assembly.stops[assembly.moved]
+    assert np.all(stops[:, 1] - stops[:, 0] > 0.01)
+    qpos = np.zeros((200, 7 + len(stops)))
+    qpos[:, 3] = 1
+    qpos[:, 7:] = np.random.default_rng(seed).uniform(*stops.T, (200, len(stops)))
+    position, turn = body_poses(robot, qpos)
+    for (i, j), gap in zip(pairs[beside], rest[beside], strict=True):
+        boxes = []
+        for k in (i, j):
+            own = turn[:, body[k]]
+            half = np.broadcast_to(table.half_size[k], (200, 3))
+            boxes += [position[:, body[k]] + own @ table.position[k], own @ table.rotation[k], half]
+        assert box_gap(pair_of(*boxes)).min() > min(gap, 0) - 6e-4
 
 
 def test_contacts_are_mujocos():
