@@ -85,6 +85,16 @@ class BodyFitness:
         block = self.block_size
         return block is not None and self.bodies.learning.blocks_of_body(block) > 0
 
+    def scores_at_half_step(
+        self, bodies: Sequence[Morphology], genes: Sequence[np.ndarray], key: jax.Array
+    ) -> np.ndarray:
+        """`[bodies]` scores of bodies with genes of their own, with half the world's timestep."""
+        step: dict[str, Any] = {"world.timestep": self.mixed.world.timestep / 2}
+        finer = make_mixed_fitness(self.config, bodies, **step)
+        robots = [finer.build(body) for body in bodies]
+        padded = [finer.pad_genes(own, robot) for own, robot in zip(genes, robots, strict=True)]
+        return np.asarray(finer(finer.pack(robots), np.stack(padded), key))
+
     @cached_property
     def identity(self) -> str:
         """Fingerprint of the world and the types of modules, on which scores depend."""

@@ -157,7 +157,7 @@ class NamedGenes:
         """Genes by name, the first parent's first, with noise.
 
         A copied joint has the genes of its original, a new one those of the nearest joint with
-        inherited genes; if there is none, they are drawn. A pair whose joints have changed their
+        inherited genes; if there is none, they are drawn. A pair of joints that have changed their
         order has the negative gene.
         """
         noise = self.settings.mutation * rng.standard_normal(len(layout.names))

@@ -195,7 +195,7 @@ def choose_candidate(
     eligible: np.ndarray,
     seed: int,
     judge: Callable[[int], Passport] | None = None,
-    screen: Callable[[Sequence[int]], Sequence[bool]] | None = None,
+    screen: Callable[[Sequence[int]], Sequence[int]] | None = None,
 ) -> tuple[int, dict[str, Any]]:
     """Chooses among candidates on fresh starts, and evaluates the winner on others.
 
@@ -209,8 +209,8 @@ def choose_candidate(
         seed: of the run.
         judge: makes a candidate's passport, where that is required: then the best of the best few
             that passes wins, or the best of all where none does.
-        screen: whether candidates may pass, of many at once; those that may not are not judged
-            once the best of all has failed.
+        screen: how likely candidates pass, of many at once: once the best of all has failed, those
+            with 0 are not judged, and those with more come first.
 
     Returns:
         The winner's index, and `score`, `std`, `measures`, `key` and `passport` of its `Champion`.
@@ -238,7 +238,8 @@ def choose_candidate(
         if passport.failed:
             left = [int(k) for k in order[1:] if eligible[k] and means[k] > FAILED_SCORE]
             if left and screen is not None:
-                left = [k for k, may in zip(left, screen(left), strict=True) if may]
+                chances = dict(zip(left, screen(left), strict=True))
+                left = sorted((k for k in left if chances[k]), key=lambda k: -chances[k])
             for k in left[: _TRIED - 1]:
                 found = judge(k)
                 if not found.failed:

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from mjx_revolve.episodes.config import Config
-from mjx_revolve.episodes.passport import Passport, joint_checks, make_passport
+from mjx_revolve.episodes.passport import STEP, Passport, joint_checks, make_passport
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.evolution.blocks import Scored
 from mjx_revolve.evolution.body_fitness import BodyFitness
@@ -23,8 +23,8 @@ from mjx_revolve.inputs.errors import InputError
 # Descriptors with their population mean in the metrics.
 MEAN_DESCRIPTORS = ("num_modules", "num_hinges", "length", "mass", "branching", "limbs", "symmetry")
 
-# Number of candidates where a passport is required. A choice: some tens, as populations have.
-_CANDIDATES = 32
+# Number of candidates where a passport is required. A choice: all of most populations.
+_CANDIDATES = 64
 
 
 class IndividualSearch(Protocol):
@@ -82,16 +82,27 @@ class IndividualEvolution:
             one = candidates[k]
             return make_passport(self.fitness.body_fitness(one.body), one.genes, seed)
 
-        def screen(indices: Sequence[int]) -> list[bool]:
-            """Whether joints do in one episode what servos can: one program for all."""
+        def screen(indices: Sequence[int]) -> list[int]:
+            """1 where joints do in one episode what servos can, 2 where scores hold at half a step.
+
+            Populations come to fit their step together: one program for all is sooner done than a
+            passport of each.
+            """
             robots = [self.fitness.build(candidates[k].body) for k in indices]
             genes = [np.array(candidates[k].genes, np.float32) for k in indices]
-            swum = self.fitness.mixed.replay(robots, genes, replay_key(seed))
+            key = replay_key(seed)
+            swum = self.fitness.mixed.replay(robots, genes, key)
             settle = self.config.task.settle
-            return [
+            sound = [
                 all(check.passed for _, check in joint_checks(robot, trajectory, settle))
                 for robot, trajectory in zip(robots, swum, strict=True)
             ]
+            usual = score(indices, key)[0]
+            finer = self.fitness.scores_at_half_step(
+                [candidates[k].body for k in indices], genes, key
+            )
+            holds = np.abs(finer - usual) <= STEP * np.abs(usual)
+            return [int(a) * (1 + int(b)) for a, b in zip(sound, holds, strict=True)]
 
         winner, judged = choose_candidate(
             score, np.ones(len(candidates), bool), seed, judge if required else None, screen

@@ -22,7 +22,7 @@ from mjx_revolve.evolution.coevolution import BodyEvolution
 from mjx_revolve.evolution.executor import Executor
 from mjx_revolve.evolution.generations import run_generations
 from mjx_revolve.evolution.individuals import features, from_record, to_record
-from mjx_revolve.evolution.learning import evaluate_again, learn, score_brains
+from mjx_revolve.evolution.learning import evaluate_again, learn, learnt_genes, score_brains
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from toys import CLOCK, make_toy_bodies
@@ -129,6 +129,31 @@ def test_where_a_passport_is_required_the_living_are_candidates_too(folder, monk
     champion = BodyEvolution(config, executor).choose_champion(search)
     assert champion.individual == last.number and not champion.passport.failed
     assert len(tried) == 2 and tried[0] in failing
+
+
+def test_those_that_hold_their_score_at_half_the_step_are_tried_first(folder, monkeypatch):
+    config, executor = start(folder, {"selection": {"type": "plus", "passport": "required"}})
+    search, _ = run(config, executor)
+    candidates = individual_search.list_candidates(search, True)
+    last, tried = candidates[-1], []
+
+    def judged(fitness, genes, seed):
+        tried.append(genes)
+        return Passport({"kept": Check("kept", float(genes == last.genes), least=0.5)})
+
+    def halved(fitness, bodies, genes, key):
+        """Only the last one's score stays."""
+        left = [one for body in bodies for one in candidates if one.body is body]
+        rows = [learnt_genes(fitness, one) for one in left]
+        found = [scores[0] for scores, _ in score_brains(executor, left, rows, key)]
+        return np.where([one is last for one in left], found, np.nan)
+
+    monkeypatch.setattr(individual_search, "make_passport", judged)
+    monkeypatch.setattr(type(executor.fitness), "scores_at_half_step", halved)
+    monkeypatch.setattr(type(executor.fitness.mixed), "replay", lambda _, robots, genes, key: genes)
+    monkeypatch.setattr(individual_search, "joint_checks", lambda *_: [])
+    champion = BodyEvolution(config, executor).choose_champion(search)
+    assert champion.individual == last.number and len(tried) == 2
 
 
 @pytest.mark.long
