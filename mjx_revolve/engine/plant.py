@@ -238,11 +238,6 @@ class Plant:
         """Rows that are hinges; those of thrusters follow."""
         return self.num_rows - self.num_thrusters
 
-    @property
-    def active(self) -> Any:
-        """`[n, lanes]` whether a row is an actuator at all."""
-        return self.source < self.num_actuators
-
     def arrange(self, values: jax.Array) -> jax.Array:
         """Values of actuators in the engine's order.
 

@@ -85,15 +85,23 @@ class BodyFitness:
         block = self.block_size
         return block is not None and self.bodies.learning.blocks_of_body(block) > 0
 
-    def scores_at_half_step(
+    def step_changes(
         self, bodies: Sequence[Morphology], genes: Sequence[np.ndarray], key: jax.Array
     ) -> np.ndarray:
-        """`[bodies]` scores of bodies with genes of their own, with half the world's timestep."""
-        step: dict[str, Any] = {"world.timestep": self.mixed.world.timestep / 2}
-        finer = make_mixed_fitness(self.config, bodies, **step)
-        robots = [finer.build(body) for body in bodies]
-        padded = [finer.pad_genes(own, robot) for own, robot in zip(genes, robots, strict=True)]
-        return np.asarray(finer(finer.pack(robots), np.stack(padded), key))
+        """`[bodies]` shares by which scores of bodies with brains change at half the timestep.
+
+        As in passports, in the world's own water.
+        """
+        found = []
+        for part in (1, 2):
+            changes: dict[str, Any] = {
+                "world.timestep": self.mixed.world.timestep / part, "task.robust": None,
+            }  # fmt: skip
+            mixed = make_mixed_fitness(self.config, bodies, **changes)
+            robots = [mixed.build(body) for body in bodies]
+            padded = [mixed.pad_genes(own, robot) for own, robot in zip(genes, robots, strict=True)]
+            found.append(np.asarray(mixed(mixed.pack(robots), np.stack(padded), key)))
+        return np.abs(found[1] - found[0]) / np.maximum(np.abs(found[0]), 1e-9)
 
     @cached_property
     def identity(self) -> str:

@@ -97,11 +97,8 @@ class IndividualEvolution:
                 all(check.passed for _, check in joint_checks(robot, trajectory, settle))
                 for robot, trajectory in zip(robots, swum, strict=True)
             ]
-            usual = score(indices, key)[0]
-            finer = self.fitness.scores_at_half_step(
-                [candidates[k].body for k in indices], genes, key
-            )
-            holds = np.abs(finer - usual) <= STEP * np.abs(usual)
+            bodies = [candidates[k].body for k in indices]
+            holds = self.fitness.step_changes(bodies, genes, key) <= STEP
             return [int(a) * (1 + int(b)) for a, b in zip(sound, holds, strict=True)]
 
         winner, judged = choose_candidate(

@@ -48,7 +48,7 @@ class Drive:
 
 
 @lru_cache(maxsize=8)
-def _program(variants: Variants, lanes: int, windows: int, steps: int, every: int) -> Any:
+def _program(variants: Variants, lanes: int, steps: int, every: int) -> Any:
     """The jitted simulation of `lanes` variants of each recording."""
     world = variants.tree.world
 
@@ -120,9 +120,9 @@ def simulate_windows(
         `[V, R, K, 1 + N / every, 13 + hinges]` the core's states and the hinges' angles, at the
         beginning of each window and after every `every` steps of it.
     """
-    windows, steps = drive.ctrl.shape[:2]
+    steps = drive.ctrl.shape[1]
     with jax.enable_x64(True):
-        run = _program(variants, len(robots), windows, steps, every)
+        run = _program(variants, len(robots), steps, every)
         given = (variants.stack(robots), roots, drive.resets, drive.angles, drive.speeds,
                  drive.ctrl, drive.later, current, drive.begin)  # fmt: skip
         found = np.asarray(run(*given))

@@ -371,13 +371,13 @@ class _Plain:
             raise ConstraintError("links", "one between two ends", "two with the same ends")
 
 
-def read_cppn(plain: object, place: str = "network") -> CPPN:
+def read_cppn(plain: object) -> CPPN:
     """A network from what `CPPN.to_plain` made.
 
     Raises:
         InputError: it is no network.
     """
-    found = read(_Plain, plain, place)
+    found = read(_Plain, plain, "genome")
     return CPPN(
         num_inputs=found.num_inputs,
         num_outputs=found.num_outputs,

@@ -54,7 +54,7 @@ def make_cppn(space: Space, params: Mapping[str, object], place: str) -> Genotyp
     outputs = 2 + len(space.modules)
 
     def from_plain(plain: object) -> CPPN:
-        network = read_cppn(plain, "genome")
+        network = read_cppn(plain)
         found = (network.num_inputs, network.num_outputs)
         if found != (_INPUTS, outputs):
             raise InputError(

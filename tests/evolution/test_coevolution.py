@@ -22,7 +22,7 @@ from mjx_revolve.evolution.coevolution import BodyEvolution
 from mjx_revolve.evolution.executor import Executor
 from mjx_revolve.evolution.generations import run_generations
 from mjx_revolve.evolution.individuals import features, from_record, to_record
-from mjx_revolve.evolution.learning import evaluate_again, learn, learnt_genes, score_brains
+from mjx_revolve.evolution.learning import evaluate_again, learn, score_brains
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from toys import CLOCK, make_toy_bodies
@@ -141,15 +141,12 @@ def test_those_that_hold_their_score_at_half_the_step_are_tried_first(folder, mo
         tried.append(genes)
         return Passport({"kept": Check("kept", float(genes == last.genes), least=0.5)})
 
-    def halved(fitness, bodies, genes, key):
+    def changes(fitness, bodies, genes, key):
         """Only the last one's score stays."""
-        left = [one for body in bodies for one in candidates if one.body is body]
-        rows = [learnt_genes(fitness, one) for one in left]
-        found = [scores[0] for scores, _ in score_brains(executor, left, rows, key)]
-        return np.where([one is last for one in left], found, np.nan)
+        return np.array([0.0 if body is last.body else 0.5 for body in bodies])
 
     monkeypatch.setattr(individual_search, "make_passport", judged)
-    monkeypatch.setattr(type(executor.fitness), "scores_at_half_step", halved)
+    monkeypatch.setattr(type(executor.fitness), "step_changes", changes)
     monkeypatch.setattr(type(executor.fitness.mixed), "replay", lambda _, robots, genes, key: genes)
     monkeypatch.setattr(individual_search, "joint_checks", lambda *_: [])
     champion = BodyEvolution(config, executor).choose_champion(search)

@@ -51,15 +51,11 @@ class SweepReport(NamedTuple):
     Attributes:
         page: HTML that needs no other file.
         table: CSV, a row for each finished run.
-        finished: how many runs are.
-        planned: how many there are to be.
         lost: a line on each run that could not be read.
     """
 
     page: Path
     table: Path
-    finished: int
-    planned: int
     lost: list[str]
 
 
@@ -88,7 +84,7 @@ def write_report(folder: str | Path, page: Path | None = None) -> SweepReport:
     text = make_report(sweep, folder, outcomes, lost, page.parent)
     write_csv(folder / TABLE, list_rows(sweep, outcomes))
     write_atomic(page, text.encode())
-    return SweepReport(page, folder / TABLE, len(outcomes), len(plans), lost)
+    return SweepReport(page, folder / TABLE, lost)
 
 
 def list_rows(sweep: Sweep, outcomes: Sequence[Outcome]) -> list[dict[str, object]]:
