@@ -39,8 +39,10 @@ def main(argv: list[str] | None = None) -> int:
     from mjx_revolve.episodes.run_reader import RunReader, find_run
 
     with opening(arguments.run, trust=arguments.trust):
-        champion = RunReader(find_run(arguments.run)).load_champion()
+        folder = find_run(arguments.run)
+        champion = RunReader(folder).load_champion()
         champion.load_config()  # before JAX is imported
+        check_place(folder / "any", short_path(folder))
         runtime.prepare_process()
         return _judge(arguments)
 
@@ -55,7 +57,6 @@ def _judge(arguments: argparse.Namespace) -> int:
     config = champion.load_config()
     fitness = make_fitness(config)
     champion.check_genes(fitness.num_genes, "config.yaml")
-    check_place(folder / PASSPORT, short_path(folder))
     passport = make_passport(fitness, champion.genes, config.evolution.seed)
     widths = [max(len(row[k]) for row in passport.rows) for k in range(3)]
     for row in passport.rows:

@@ -621,8 +621,9 @@ def _pick_rows(
         number[table[shell, robot]] = shell
         ends = np.searchsorted(part, pairs)
         owner = assembly.robot[held[ends[:, 0]]] if len(pairs) else np.zeros(0, int)
-        met[:, _ranks(owner), owner] = number[ends].T
-        rest[_ranks(owner), owner] = rest_overlaps(assembly, pairs)
+        nth = _ranks(owner)
+        met[:, nth, owner] = number[ends].T
+        rest[nth, owner] = rest_overlaps(assembly, pairs)
         blank = np.append(part, len(assembly.fluid.volume))
         shells = blank[in_rows] if most[0] else None
         root_shells = blank[in_roots] if most[1] else None

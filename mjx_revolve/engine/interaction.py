@@ -44,9 +44,10 @@ _SPEED_MARGIN = 1.2
 # Pairs of robots tested together, pairs of spheres that they may add to the list, and pairs of
 # spheres with forces computed together: enough for vector registers, few enough that two
 # robots in contact do not cost as much as a crowd. Choices.
-_PAIRS, _FOUND, _PUSHED = 4, 2048, 64
-# Room in the list for so many pairs of spheres per robot; more than heaps have. A choice.
-_ROOM = 256
+_PAIRS, _FOUND, _PUSHED = 4, 512, 64
+# Room in the list for so many pairs of spheres per robot; more than most heaps have. A choice: four
+# times as many cost a crowd a fifth to a third more, and a full list looks ahead by the step.
+_ROOM = 64
 # At most so many sweeps over all contacts, and what the last one may still change in the speed of
 # any [m/s]. Choices: two plates that meet flat need six.
 _SWEEPS, _ENOUGH = 16, 1e-3

@@ -86,7 +86,8 @@ def _balls(assembly: Assembly) -> _Ball:
         body += [int(table.body[k])] * len(places)
         center.append(table.position[k] + places @ table.rotation[k].T)
         radius += [size] * len(places)
-    return _Ball(np.array(body, int), np.concatenate(center), np.array(radius))
+    none = np.zeros((0, 3))  # of a robot that touches nothing
+    return _Ball(np.array(body, int), np.concatenate([none, *center]), np.array(radius, float))
 
 
 def pack_spheres(

@@ -417,12 +417,6 @@ def _variants(robot: Robot, names: tuple[str, ...], prescribed: tuple[bool, ...]
     parameters = read_free(names, robot)
     build = partial(with_values, robot, parameters)
     usual, near = build(np.zeros(len(names))), [build(0.1 * x) for x in np.eye(len(names))]
-    for name, other in zip(names, near, strict=True):
-        if not make_variants([usual, other], prescribed).rows:
-            raise InputError(
-                f"--free {name}: expected a number that this robot in its water depends on; found "
-                "one that changes nothing"
-            )
     far = []
     for sign in (-1, 1):
         # Some numbers of the step, such as bounds, change only from a threshold on.
@@ -431,7 +425,15 @@ def _variants(robot: Robot, names: tuple[str, ...], prescribed: tuple[bool, ...]
         for offsets in (ends, *np.diag(ends)):
             with contextlib.suppress(InputError):  # no such robot
                 far.append(build(offsets))
-    return make_variants([usual, robot, *near, *far], prescribed)
+    variants = make_variants([usual, robot, *near, *far], prescribed)
+    numbers = variants.stack([usual, *near])
+    for k, name in enumerate(names, 1):
+        if all(np.array_equal(x[..., k], x[..., 0]) for x in numbers):
+            raise InputError(
+                f"--free {name}: expected a number that this robot in its water depends on; found "
+                "one that changes nothing"
+            )
+    return variants
 
 
 def _held_out(count: int, share: float) -> np.ndarray:
