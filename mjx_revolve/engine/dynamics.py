@@ -28,7 +28,7 @@ from mjx_revolve.engine.self_contact import (
     Robots,
     contact_acceleration,
 )
-from mjx_revolve.engine.servos import end_stop, servo
+from mjx_revolve.engine.servos import end_stop, servo, spring_damping
 from mjx_revolve.engine.state import State, effective_gravity, has_acceleration
 from mjx_revolve.engine.tree import Tree
 from mjx_revolve.numerics.articulated import eliminate_joint, solve_root, to_parent, upper
@@ -151,7 +151,7 @@ def accelerate(
         axis = axis_of(motion)
         column = apply_block(block, *axis)
         motor, load, inertia = _at_hinges(
-            level.hinges, angle, speed, target, dt, column[0][2], neg(bias[0][2])
+            world, level.hinges, angle, speed, target, dt, column[0][2], neg(bias[0][2])
         )
         block, bias, joint = eliminate_joint(
             block,
@@ -445,6 +445,7 @@ def _inertia_and_bias(
 
 
 def _at_hinges(
+    world: World,
     hinges: Hinges,
     angle: Scalar,
     speed: Scalar,
@@ -460,7 +461,8 @@ def _at_hinges(
     friction = mul(hinges.damping, speed)
     inertia = add(hinges.armature, mul(dt, hinges.damping))
     load = sub(push, friction)
-    motor, more = servo(hinges, angle, speed, target, dt, add(moved, inertia), load)
+    whole, damped = add(moved, inertia), spring_damping(world)
+    motor, more = servo(hinges, angle, speed, target, dt, whole, load, damped)
     inertia = add(inertia, more)
     gain = mul(dt, add(motor, load) / add(moved, inertia))
     stop, more = end_stop(hinges, angle, speed, dt, gain)

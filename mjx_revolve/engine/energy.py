@@ -23,7 +23,7 @@ from mjx_revolve.engine.level import Level
 from mjx_revolve.engine.plant import actuators_of
 from mjx_revolve.engine.population import actuate, init, tree_plant
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.engine.servos import end_stop, motor_torque
+from mjx_revolve.engine.servos import end_stop, motor_torque, spring_damping
 from mjx_revolve.engine.single_tree import SingleTree, make_single_tree
 from mjx_revolve.engine.state import effective_gravity
 from mjx_revolve.engine.variation import Variation
@@ -149,7 +149,8 @@ def _powers(
         below = zip(*moved, before.angle, before.speed, end.speed, targets, strict=True)
         for level, (first, second, angle, *speeds, target) in zip(tree.below, below, strict=True):
             found.append(_on_bodies(tree.world, level, (first[0], second[0]), water, thrusts))
-            found.append(_at_hinges(level, angle, (speeds[0], speeds[1]), target, dt))
+            pair, damped = (speeds[0], speeds[1]), spring_damping(tree.world)
+            found.append(_at_hinges(level, angle, pair, target, dt, damped))
         sums: dict[str, jax.Array] = {}
         for name, x in (item for each in found for item in each.items()):
             bodies = np.shape(x)[0] if np.ndim(x) else 1
@@ -214,16 +215,21 @@ def _on_bodies(
 
 
 def _at_hinges(
-    level: Level, angle: Scalar, speeds: tuple[Scalar, Scalar], target: Scalar, dt: float
+    level: Level,
+    angle: Scalar,
+    speeds: tuple[Scalar, Scalar],
+    target: Scalar,
+    dt: float,
+    damped: float,
 ) -> dict[str, Scalar]:
     """Of servos, friction and end stops, `[nbody, lanes]` each [J, W].
 
-    `speeds`: at the step's beginning and at its end.
+    `speeds`: at the step's beginning and at its end; `damped`: see `servo`.
     """
     hinges, (before, after) = level.hinges, speeds
     mean = (before + after) / 2
     assert hinges is not None
-    servo = motor_torque(hinges, angle, after, target, dt) * mean
+    servo = motor_torque(hinges, angle, after, target, dt, damped) * mean
     stop, _ = end_stop(hinges, angle, after, dt)
     return {
         "kinetic_before": 0.5 * hinges.armature * before**2,

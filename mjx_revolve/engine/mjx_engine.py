@@ -25,7 +25,7 @@ from mjx_revolve.engine.hydrodynamics import PreviousStep
 from mjx_revolve.engine.kinematics import body_motions, center_of_mass
 from mjx_revolve.engine.plant import Plant, plant_of
 from mjx_revolve.engine.robot import Robot, check_timestep, import_mjx
-from mjx_revolve.engine.servos import end_stop, servo
+from mjx_revolve.engine.servos import end_stop, servo, spring_damping
 from mjx_revolve.engine.single_tree import SingleTree, make_single_tree
 from mjx_revolve.engine.state import RootState, State, integrate_quat
 from mjx_revolve.engine.thrusters import run_thrusters
@@ -489,7 +489,8 @@ def _add_servos(
         held = jnp.linalg.solve(jacobian[:, :6], drifting)
         load.append(load_j + row[:6] @ held)
     moved, push = jnp.stack(moved_inertia)[:, None], jnp.stack(load)[:, None]
-    motor, inertia = servo(hinges, angle, speed, ctrl[v - 6][:, None], plan.dt, moved, push)
+    damped, target = spring_damping(plan.tree.world), ctrl[v - 6][:, None]
+    motor, inertia = servo(hinges, angle, speed, target, plan.dt, moved, push, damped)
     gain = plan.dt * (motor + push) / (moved + inertia)
     stop, stop_inertia = end_stop(hinges, angle, speed, plan.dt, gain)
     implicit, torque = (inertia + stop_inertia)[:, 0], (motor + stop)[:, 0]

@@ -8,6 +8,8 @@ import numpy as np
 
 from mjx_revolve.engine.level import Hinges
 from mjx_revolve.numerics.spatial import Scalar, add, mul, sub
+from mjx_revolve.water.drag import is_extrapolated
+from mjx_revolve.water.world import World
 
 # Ratio of the end stops' damper to their spring [s]. A choice: a leg arrives over-damped.
 STOP_TIME = 0.005
@@ -20,9 +22,14 @@ _MARGIN = 8.0
 # Numerical damping γ of springs that are too stiff for an explicit step (Newmark 1959): they act on
 # q + γ dt q̇ + (1 + γ)²/4 dt² q̈. 0 is the trapezoidal rule, which lets them ring, 1 the angle at the
 # end of the step, by which joints lag. A choice: what it has no time for falls to two thirds in a
-# step.
-_SPRING_DAMPING = 0.2
+# step. Drag that is extrapolated explicitly feeds what rings: there it dies at once.
+_SPRING_DAMPING, _EXTRAPOLATED = 0.2, 1.0
 _TINY = 1e-12  # [N·m]
+
+
+def spring_damping(world: World) -> float:
+    """Numerical damping γ in a world of springs that are too stiff for an explicit step [-]."""
+    return _EXTRAPOLATED if is_extrapolated(world.drag) else _SPRING_DAMPING
 
 
 def servo(
@@ -33,6 +40,7 @@ def servo(
     dt: float,
     inertia: Scalar,
     load: Scalar,
+    damped: float = _SPRING_DAMPING,
 ) -> tuple[Scalar, Scalar]:
     """Torque of the position servos, and what an implicit step adds to the joints' inertia.
 
@@ -48,7 +56,7 @@ def servo(
     top speed, which lies below the curve, so that no push, however the hinges are coupled, drives
     a hinge past its top speed; elsewhere the push is constant. Of a spring that is too stiff for an
     explicit step of the limb, a part acts in the middle of the steps before and after instead,
-    linearly implicit (`_SPRING_DAMPING`).
+    linearly implicit (`spring_damping`).
 
     Args:
         hinges: their numbers.
@@ -58,18 +66,19 @@ def servo(
         dt: for which the line is implicit [s]; 0 for none.
         inertia: that the hinge moves, its parent held still, with all that is implicit [kg·m²].
         load: torque of all but the motor and the end stops [N·m].
+        damped: `spring_damping` of the world [-].
 
     Returns:
         Torque [N·m] and inertia [kg·m²], `[nbody, lanes]`.
     """
     target = jnp.clip(target, _cast(hinges.target[0], target), _cast(hinges.target[1], target))
     torque = sub(mul(hinges.gain, target), mul(hinges.stiffness, angle))
-    damping = add(hinges.servo_damping, mul(_SPRING_DAMPING * dt, hinges.implicit_stiffness))
+    damping = add(hinges.servo_damping, mul(damped * dt, hinges.implicit_stiffness))
     torque = sub(torque, mul(damping, speed))
     low, high = (_cast(x, torque) for x in hinges.effort)
     # At its limit, torque does not depend on the angle, but the step may lead back below: the
     # secant of the limited spring. With none of it, light limbs swing from limit to limit for ever.
-    square = jnp.asarray((1 + _SPRING_DAMPING) ** 2 / 4 * dt * dt, torque.dtype)
+    square = jnp.asarray((1 + damped) ** 2 / 4 * dt * dt, torque.dtype)
     limit = jnp.maximum(jnp.where(torque > 0, high, -low), 0)
     share = jnp.minimum(limit / jnp.maximum(jnp.abs(torque), _TINY), 1)
     yielding = mul(square * share, hinges.implicit_stiffness)
@@ -96,7 +105,12 @@ def servo(
 
 
 def motor_torque(
-    hinges: Hinges, angle: Scalar, speed: Scalar, target: Scalar, dt: float = 0.0
+    hinges: Hinges,
+    angle: Scalar,
+    speed: Scalar,
+    target: Scalar,
+    dt: float = 0.0,
+    damped: float = _SPRING_DAMPING,
 ) -> Scalar:
     """Torque of the motors now, not what an implicit step makes of it, without joints' friction.
 
@@ -106,11 +120,12 @@ def motor_torque(
         speed: of the joints [rad/s].
         target: of the servos [rad].
         dt: since the angle was so, for what is taken at the end of a step [s].
+        damped: `spring_damping` of the world [-].
 
     Returns:
         The torque [N·m].
     """
-    torque, _ = servo(hinges, angle, speed, target, dt, 1.0, 0.0)
+    torque, _ = servo(hinges, angle, speed, target, dt, 1.0, 0.0, damped)
     # Beyond the top speed that torque brakes; a motor has no more than its effort.
     return jnp.clip(torque, *(_cast(x, torque) for x in hinges.effort))
 

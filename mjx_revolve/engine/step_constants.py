@@ -368,7 +368,7 @@ def _read_bounds(
     stated = np.broadcast_to(table.coefficients["drag_coefficient"].T, (3, len(x))).max(0)
     stated = 2 * stated * table.factors.get("drag", 1.0)
     for name, law in laws.items():
-        bound = None if law.explicit else law.steepest
+        bound = law.steepest
         if callable(bound):
             found = getattr(numbers[name], "density", density) * bound(numbers[name])
         else:

@@ -49,3 +49,9 @@ def find_drag_law(name: str) -> DragLaw:
 def drags_whole_bodies(name: str) -> bool:
     """Whether the drag law of a name acts on a moving body as a whole, not on its parts."""
     return isinstance(find_drag_law(name), BodyDragLaw)
+
+
+def is_extrapolated(name: str) -> bool:
+    """Whether a step takes the drag law of a name explicitly, but in the middle of the step."""
+    law = find_drag_law(name)
+    return law.explicit and law.steepest is not None

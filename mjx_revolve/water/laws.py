@@ -291,7 +291,8 @@ class DragLaw:
         varied: whether `task.robust` varies it.
         steepest: bound g of the force's gradient: its derivative by the speed v is at most g ρ A v,
             with A the part's largest face; or a function: numbers → g A [m²]. None where there is
-            none (drag that is linear in v) and for laws that a step takes explicitly.
+            none (drag that is linear in v), and for explicit laws that act with the velocity at the
+            step's beginning.
         by_faces: whether faces have the C_d that modules state, which may exceed that bound.
         coefficients: what users may give for it.
         parameters: checked class of more of them, which modules have under its name, and worlds

@@ -1,6 +1,8 @@
 """MuJoCo's two drag laws: the inertia box of a body, and the ellipsoid of a part.
 
-`v` and `w` are relative to the water (Fossen's ν_r). Both are explicit, as in MuJoCo's Euler step.
+`v` and `w` are relative to the water (Fossen's ν_r). Both are explicit, as in MuJoCo's Euler step:
+the inertia box with the velocity at the step's beginning, as there, the ellipsoid with that in its
+middle, for bodies heavy enough.
 """
 
 from __future__ import annotations
@@ -88,6 +90,7 @@ class EllipsoidNumbers:
         viscous_turning: the same against turning [N·m·s].
         mass: virtual mass [kg].
         inertia: virtual inertia [kg·m²].
+        gradient: bound of the force's derivative by the speed, over density and speed [m²].
     """
 
     areas: Any = part_field("-", axes="size", blank=1.0, fixed=_AS_IT_IS)
@@ -100,6 +103,7 @@ class EllipsoidNumbers:
     viscous_turning: Any = part_field("N m s", fixed=_AS_IT_IS)
     mass: Any = part_field("kg", axes="size", fixed=_AS_IT_IS)
     inertia: Any = part_field("kg m2", axes="size", fixed=_AS_IT_IS)
+    gradient: Any = part_field("m2", fixed=_AS_IT_IS)
 
 
 def ellipsoid_numbers(
@@ -130,6 +134,11 @@ def ellipsoid_numbers(
     turning = angular[..., None] * own + slender[..., None] * (inertia_max - own)
     diameter = 2 / 3 * s.sum(-1)
     dense = density * interaction
+    # Drag is of second order in the speed. Lift grows the fastest where the flow is along the part:
+    # by (1 - a) / √a of the Kutta coefficient, with the smallest squared area a over the largest.
+    least = areas.min(-1) / largest
+    falling = 2 * ((blunt - slender) * facing + slender * np.pi * large * middle)
+    rising = kutta * facing * (1 - least) / np.sqrt(least)
     return EllipsoidNumbers(
         areas=areas / largest[..., None],
         kutta=dense * kutta * facing,
@@ -141,6 +150,7 @@ def ellipsoid_numbers(
         viscous_turning=viscosity * interaction * np.pi * diameter**3,
         mass=dense[..., None] * g[..., 6:9],
         inertia=dense[..., None] * g[..., 9:12],
+        gradient=interaction * (falling + rising),
     )
 
 
@@ -228,6 +238,7 @@ ELLIPSOID = PartDragLaw(
     summary="MuJoCo's law for an ellipsoid, with lift",
     explicit=True,
     varied=False,
+    steepest=lambda ellipsoid: ellipsoid.gradient,
     numbers=_numbers_of_ellipsoids,
     force=_ellipsoid_drag,
     mj_fluidcoef=ELLIPSOID_COEFFICIENTS,

@@ -18,6 +18,7 @@ from laboratory import (
 )
 from mjx_revolve.water.face_drag import face_drag_coefficients
 from mjx_revolve.water.mujoco_drag import (
+    ELLIPSOID,
     EllipsoidNumbers,
     ellipsoid,
     ellipsoid_numbers,
@@ -124,6 +125,46 @@ def test_a_body_that_displaces_nothing_has_the_inertia_boxs_drag():
     own = mass / 12 * (np.sum(size**2) - size**2)
     turning = np.array(torque)[:, None] * share - np.cross(0.5 * np.ones(3), 0.5 * own)[:, None]
     assert found[3:] == pytest.approx(turning / own[:, None], rel=1e-9)
+
+
+def test_the_ellipsoids_drag_acts_in_the_middle_of_the_step():
+    """A coasting cube: v = v₀ / (1 + c v₀ t / m); twice the step, four times the error."""
+    side, mass, speed = 0.04, 0.064, 0.5
+    errors = []
+    for step in (0.02, 0.01):
+        tank = world(drag="ellipsoid", added_mass=False, viscosity=0.0, timestep=step)
+        robot = box_robot((side,) * 3, mass, tank)
+        qpos, qvel = at_rest(robot, 1, -20.0)
+        qvel[1] = speed
+        time, _, after, _ = march(robot, 2.0, qpos, qvel)
+        numbers = ellipsoid_numbers(
+            np.full(3, side / 2), np.array([1, *ELLIPSOID.mj_fluidcoef, *6 * [0.0]]), RHO, 0.0
+        )
+        drag = numbers.blunt + numbers.slender
+        expected = speed / (1 + drag * speed / mass * time)
+        errors.append(np.abs(after[:, 1, 0] / expected - 1).max())
+    assert errors[1] < 3e-3
+    assert 3 < errors[0] / errors[1] < 5
+
+
+@pytest.mark.parametrize("half", [(0.02, 0.02, 0.03), (0.05, 0.03, 0.001), (0.1, 0.01, 0.01)])
+def test_the_bound_of_the_ellipsoids_step_is_never_less_than_the_slope(half):
+    """Of -∂F/∂v over |v|, from every side and nearly along the part."""
+    coefficients = np.array([1, *ELLIPSOID.mj_fluidcoef, *6 * [0.0]])
+    numbers = ellipsoid_numbers(np.array(half), coefficients, RHO, 0.0)
+    flat = {k: tuple(x) if np.ndim(x) else x for k, x in vars(numbers).items()}
+    still = (0.0, 0.0, 0.0)
+
+    def force(v):
+        return jnp.stack(ellipsoid(tuple(v), still, EllipsoidNumbers(**flat), False)[0])
+
+    draw = np.random.default_rng(0).normal(size=(3000, 3))
+    draw[1000:] *= np.random.default_rng(1).choice([1.0, 0.1, 1e-3], (2000, 3))
+    draw /= np.linalg.norm(draw, axis=1)[:, None]
+    with jax.enable_x64(True):
+        slope = -np.asarray(jax.vmap(jax.jacobian(force))(jnp.asarray(draw)))
+    steepest = np.linalg.eigvalsh((slope + slope.transpose(0, 2, 1)) / 2)[:, -1].max()
+    assert 0.2 < steepest / (RHO * ELLIPSOID.steepest(numbers)) <= 1
 
 
 def test_the_ellipsoids_gradient_is_finite_at_rest():
