@@ -1,8 +1,8 @@
 """MuJoCo's two drag laws: the inertia box of a body, and the ellipsoid of a part.
 
 `v` and `w` are relative to the water (Fossen's ν_r). Both are explicit, as in MuJoCo's Euler step:
-the inertia box with the velocity at the step's beginning, as there, the ellipsoid with that in its
-middle, for bodies heavy enough.
+the inertia box with the velocity at its beginning, too, the ellipsoid with that in its middle, for
+bodies heavy enough.
 """
 
 from __future__ import annotations
