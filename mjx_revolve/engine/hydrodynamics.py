@@ -590,7 +590,8 @@ def implicit_share(
     the water, at most that of its centre and |ω| half its diagonal. Of all parts together,
     Σ s v ≤ √(Σ s · Σ s v²) with s = g ρ A: so it follows from sums over the body, see `DragBound`.
     An extrapolated force is stable for gradients up to m / (dt (1 - z²)), which is 2.6 G or more.
-    1 in motion without such a bound, and with MuJoCo's laws, which are explicit as in MuJoCo.
+    1 in motion without such a bound. Of an explicit law, for which nothing is implicit, it is how
+    far from the middle of the step its velocity is taken, and 1 with MuJoCo's inertia box.
     """
     bound, w = level.bound, motion.angular_velocity
     if not is_present(bound.steep):

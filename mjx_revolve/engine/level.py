@@ -38,7 +38,7 @@ class DragBound(NamedTuple):
 
     Attributes:
         steep: Σ s of the parts' s, bounds of the gradient over the speed [kg/m]; next to endless
-            without a bound and with explicit laws.
+            without a bound.
         moment: Σ s x with the centres x of the parts' boxes [kg].
         inertia: Σ s (x² 1 - x xᵀ) [kg·m].
         corners: Σ s r with half the diagonals r of the boxes [kg].
