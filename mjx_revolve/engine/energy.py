@@ -8,6 +8,7 @@ energy. What is left closes to the first order of the step.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -149,8 +150,7 @@ def _powers(
         below = zip(*moved, before.angle, before.speed, end.speed, targets, strict=True)
         for level, (first, second, angle, *speeds, target) in zip(tree.below, below, strict=True):
             found.append(_on_bodies(tree.world, level, (first[0], second[0]), water, thrusts))
-            pair, damped = (speeds[0], speeds[1]), spring_damping(tree.world)
-            found.append(_at_hinges(level, angle, pair, target, dt, damped))
+            found.append(_at_hinges(tree.world, level, angle, speeds, target, dt))
         sums: dict[str, jax.Array] = {}
         for name, x in (item for each in found for item in each.items()):
             bodies = np.shape(x)[0] if np.ndim(x) else 1
@@ -215,21 +215,16 @@ def _on_bodies(
 
 
 def _at_hinges(
-    level: Level,
-    angle: Scalar,
-    speeds: tuple[Scalar, Scalar],
-    target: Scalar,
-    dt: float,
-    damped: float,
+    world: World, level: Level, angle: Scalar, speeds: Sequence[Scalar], target: Scalar, dt: float
 ) -> dict[str, Scalar]:
     """Of servos, friction and end stops, `[nbody, lanes]` each [J, W].
 
-    `speeds`: at the step's beginning and at its end; `damped`: see `servo`.
+    `speeds`: at the step's beginning and at its end.
     """
     hinges, (before, after) = level.hinges, speeds
     mean = (before + after) / 2
     assert hinges is not None
-    servo = motor_torque(hinges, angle, after, target, dt, damped) * mean
+    servo = motor_torque(hinges, angle, after, target, dt, spring_damping(world)) * mean
     stop, _ = end_stop(hinges, angle, after, dt)
     return {
         "kinetic_before": 0.5 * hinges.armature * before**2,

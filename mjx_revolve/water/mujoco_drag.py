@@ -137,8 +137,7 @@ def ellipsoid_numbers(
     # Drag is of second order in the speed. Lift grows the fastest where the flow is along the part:
     # by (1 - a) / √a of the Kutta coefficient, with the smallest squared area a over the largest.
     least = areas.min(-1) / largest
-    falling = 2 * ((blunt - slender) * facing + slender * np.pi * large * middle)
-    rising = kutta * facing * (1 - least) / np.sqrt(least)
+    steepest = 2 * np.maximum(blunt, slender) + kutta * (1 - least) / np.sqrt(least)
     return EllipsoidNumbers(
         areas=areas / largest[..., None],
         kutta=dense * kutta * facing,
@@ -150,7 +149,7 @@ def ellipsoid_numbers(
         viscous_turning=viscosity * interaction * np.pi * diameter**3,
         mass=dense[..., None] * g[..., 6:9],
         inertia=dense[..., None] * g[..., 9:12],
-        gradient=interaction * (falling + rising),
+        gradient=interaction * facing * steepest,
     )
 
 

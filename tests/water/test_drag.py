@@ -27,6 +27,7 @@ from mjx_revolve.water.mujoco_drag import (
 
 RHO = 999.1026
 G = 9.81
+MUJOCOS_GEOM = np.array([1, *ELLIPSOID.mj_fluidcoef, *6 * [0.0]])  # without virtual mass
 BRICK = ((0.041, 0.041, 0.0355), 0.0102 + 0.005, 1.07e-5)  # with 5 g of ballast, or it floats
 
 
@@ -130,17 +131,14 @@ def test_a_body_that_displaces_nothing_has_the_inertia_boxs_drag():
 def test_the_ellipsoids_drag_acts_in_the_middle_of_the_step():
     """A coasting cube: v = v₀ / (1 + c v₀ t / m); twice the step, four times the error."""
     side, mass, speed = 0.04, 0.064, 0.5
-    errors = []
+    numbers = ellipsoid_numbers(np.full(3, side / 2), MUJOCOS_GEOM, RHO, 0.0)
+    drag, errors = numbers.blunt + numbers.slender, []
     for step in (0.02, 0.01):
         tank = world(drag="ellipsoid", added_mass=False, viscosity=0.0, timestep=step)
         robot = box_robot((side,) * 3, mass, tank)
         qpos, qvel = at_rest(robot, 1, -20.0)
         qvel[1] = speed
         time, _, after, _ = march(robot, 2.0, qpos, qvel)
-        numbers = ellipsoid_numbers(
-            np.full(3, side / 2), np.array([1, *ELLIPSOID.mj_fluidcoef, *6 * [0.0]]), RHO, 0.0
-        )
-        drag = numbers.blunt + numbers.slender
         expected = speed / (1 + drag * speed / mass * time)
         errors.append(np.abs(after[:, 1, 0] / expected - 1).max())
     assert errors[1] < 3e-3
@@ -150,8 +148,7 @@ def test_the_ellipsoids_drag_acts_in_the_middle_of_the_step():
 @pytest.mark.parametrize("half", [(0.02, 0.02, 0.03), (0.05, 0.03, 0.001), (0.1, 0.01, 0.01)])
 def test_the_bound_of_the_ellipsoids_step_is_never_less_than_the_slope(half):
     """Of -∂F/∂v over |v|, from every side and nearly along the part."""
-    coefficients = np.array([1, *ELLIPSOID.mj_fluidcoef, *6 * [0.0]])
-    numbers = ellipsoid_numbers(np.array(half), coefficients, RHO, 0.0)
+    numbers = ellipsoid_numbers(np.array(half), MUJOCOS_GEOM, RHO, 0.0)
     flat = {k: tuple(x) if np.ndim(x) else x for k, x in vars(numbers).items()}
     still = (0.0, 0.0, 0.0)
 
