@@ -526,7 +526,7 @@ def main(argv: list[str] | None = None) -> int:
         groups = [group for group in groups if options.only in group.name]
         if not groups:
             names = "; ".join(group.name for group in GROUPS)
-            raise InputError(f"--only: expected part of one of: {names}; found {options.only!r}")
+            raise InputError("--only", f"part of one of: {names}", repr(options.only))
     folder = make_folder(options.out, "bench")
     target = Path(options.json or folder / ("parts.json" if options.parts else "bench.json"))
     began, before = time.monotonic(), os.getloadavg()[0]
@@ -563,7 +563,7 @@ def main(argv: list[str] | None = None) -> int:
         try:  # after each case: nothing measured is lost
             target.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
         except OSError as error:
-            raise InputError(f"--json: expected a file to write; found {error.strerror}") from None
+            raise InputError("--json", "a file to write", error.strerror) from None
     if options.results:
         numbers = {key: report[key] for key in ("settings", "load_average", "cases")}
         write_results("bench_parts" if options.parts else "bench", numbers, ())

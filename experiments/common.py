@@ -52,7 +52,7 @@ def check_whole(parser: Parser, options: argparse.Namespace, *names: str) -> Non
     for name in names:
         if options.results and getattr(options, name) != parser.get_default(name):
             option = name.replace("_", "-")
-            raise InputError(f"--results: expected all of the study; found --{option}")
+            raise InputError("--results", "all of the study", f"--{option}")
 
 
 def make_folder(out: str | None, name: str) -> Path:
@@ -72,9 +72,7 @@ def make_folder(out: str | None, name: str) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(
-            f"--out: expected a folder to write into; found {error.strerror}: {out}"
-        ) from None
+        raise InputError("--out", "a folder to write into", f"{error.strerror}: {out}") from None
     return folder
 
 

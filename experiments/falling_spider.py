@@ -162,9 +162,9 @@ def load_thesis(folder: Path) -> dict[str, np.ndarray] | None:
         try:
             heights = np.loadtxt(path, ndmin=1)
         except ValueError as error:
-            raise InputError(f"{path}: expected one number in each row; found {error}") from None
+            raise InputError(path, "one number in each row", error) from None
         if heights.ndim != 1 or len(heights) < rows:
-            raise InputError(f"{path}: expected at least {rows} rows; found {heights.shape}")
+            raise InputError(path, f"at least {rows} rows", heights.shape)
         data[kind] = heights[:rows]
     return data
 

@@ -154,7 +154,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--rounds", type=whole(1), default=3, metavar="N")
     options = parser.parse_args(argv)
     if not (ROOT / "morphologies" / f"{options.robot}.yaml").is_file():
-        raise InputError(f"--robot: expected a shipped morphology; found {options.robot!r}")
+        raise InputError("--robot", "a shipped morphology", repr(options.robot))
     os.environ["MJX_REVOLVE_FUSE"] = "0"  # our annotations for XLA:CPU
     import jax
 

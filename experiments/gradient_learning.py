@@ -150,9 +150,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of everything (default: 0)")
     args = parser.parse_args(argv)
     if not 0 < args.seconds < 86400:
-        raise InputError(f"--seconds: expected a number > 0, below a day; found {args.seconds:g}")
+        raise InputError("--seconds", "a number > 0, below a day", f"{args.seconds:g}")
     if not 0 <= args.seed < 2**31:
-        raise InputError(f"--seed: expected 0 to {2**31 - 1}; found {args.seed}")
+        raise InputError("--seed", f"0 to {2**31 - 1}", args.seed)
     config = load_config(CONFIG, CHANGES | {"task.trials": EPISODES})
     run, config = create_run_folder(
         make_folder(args.out, "gradient_learning"), config, seed=args.seed

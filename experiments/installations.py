@@ -162,7 +162,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     names = args.only.split(",")
     if unknown := [name for name in names if name not in COLUMNS]:
-        raise InputError(f"--only: expected any of {', '.join(COLUMNS)}; found {unknown[0]}")
+        raise InputError("--only", f"any of {', '.join(COLUMNS)}", unknown[0])
     folder = make_folder(args.out, "installations").resolve()
     found = {name: try_column(name, folder, args.tests) for name in names}
     path = folder / "installations.json"

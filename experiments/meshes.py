@@ -44,11 +44,11 @@ def _surface(mesh: Mesh) -> trimesh.Trimesh:
     vertices, faces = (mesh.vertices, mesh.faces) if isinstance(mesh, trimesh.Trimesh) else mesh
     vertices, faces = np.asarray(vertices, float), np.asarray(faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
-        raise InputError(f"mesh: vertices: expected shape [n, 3]; found {list(vertices.shape)}")
+        raise InputError("mesh: vertices", "shape [n, 3]", list(vertices.shape))
     if faces.ndim != 2 or faces.shape[1] != 3:
-        raise InputError(f"mesh: faces: expected triangles [m, 3]; found {list(faces.shape)}")
+        raise InputError("mesh: faces", "triangles [m, 3]", list(faces.shape))
     if faces.size and not np.issubdtype(faces.dtype, np.integer):
-        raise InputError(f"mesh: faces: expected whole numbers; found {faces.dtype}")
+        raise InputError("mesh: faces", "whole numbers", faces.dtype)
     return trimesh.Trimesh(vertices, faces.astype(np.int64), process=False)
 
 
@@ -97,7 +97,7 @@ def mesh_center_of_volume(mesh: Mesh) -> np.ndarray:
     """
     volume, center = _volume_and_center(mesh)
     if center is None:
-        raise InputError(f"mesh: expected a mesh that encloses a volume; found {volume:g} m3")
+        raise InputError("mesh", "a mesh that encloses a volume", f"{volume:g} m3")
     return center
 
 
@@ -202,17 +202,14 @@ def check_mesh(mesh: Mesh, name: str = "mesh") -> None:
         some = np.any(broken, axis=1)
         if some.any():
             raise InputError(
-                f"{name}: expected {expected}; found {some.sum()} of {len(some)} {found} "
-                f"{some.argmax()})"
+                name, f"{expected}", f"{some.sum()} of {len(some)} {found} {some.argmax()})"
             )
     # Bodies may touch along an edge, which then has four faces, or more.
     edge, ahead = surface.edges_unique_inverse, surface.edges[:, 0] < surface.edges[:, 1]
     total, along = np.bincount(edge), np.bincount(edge, weights=ahead)
     is_open = total % 2 == 1
     if is_open.any():
-        raise InputError(
-            f"{name}: expected a closed surface; found {is_open.sum()} open edges of {len(total)}"
-        )
+        raise InputError(name, "a closed surface", f"{is_open.sum()} open edges of {len(total)}")
     against = 2 * along != total
     if against.any():
         raise InputError(
@@ -221,7 +218,7 @@ def check_mesh(mesh: Mesh, name: str = "mesh") -> None:
         )
     volume, center = _volume_and_center(surface)
     if center is None:
-        raise InputError(f"{name}: expected a solid; found a flat mesh (volume {volume:.6g} m3)")
+        raise InputError(name, "a solid", f"a flat mesh (volume {volume:.6g} m3)")
     if volume < 0:
         raise InputError(
             f"{name}: expected faces that look outwards; found the mesh inside out (volume "
@@ -241,7 +238,7 @@ def _confined(path: str | Path, folder: str | Path) -> Path:
     # A file written on Windows must not find another way out.
     for kind in (PurePosixPath(text), PureWindowsPath(text)):
         if kind.is_absolute() or kind.drive or kind.root or ".." in kind.parts:
-            raise InputError(f"{text}: expected a path inside {folder}; found one that leads out")
+            raise InputError(text, f"a path inside {folder}", "one that leads out")
     return resolve_inside(text, folder)
 
 
@@ -271,7 +268,7 @@ def load_mesh(
     suffix = file.suffix.lower()
     if suffix not in _FORMATS:
         found = f"'{suffix}'" if suffix else "no suffix"
-        raise InputError(f"{path}: expected one of {', '.join(_FORMATS)}; found {found}")
+        raise InputError(path, f"one of {', '.join(_FORMATS)}", found)
     with reading(path):
         if file.stat().st_size > _MAX_BYTES:
             raise InputError(f"expected at most {_MAX_BYTES // 2**20} MiB; found more")

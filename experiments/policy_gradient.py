@@ -319,9 +319,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--envs", type=int, default=64, help="environments (default: 64)")
     args = parser.parse_args(argv)
     if not 0 < args.seconds < 86400:
-        raise InputError(f"--seconds: expected a number > 0, below a day; found {args.seconds:g}")
+        raise InputError("--seconds", "a number > 0, below a day", f"{args.seconds:g}")
     if not 0 <= args.seed < 2**31:
-        raise InputError(f"--seed: expected 0 to {2**31 - 1}; found {args.seed}")
+        raise InputError("--seed", f"0 to {2**31 - 1}", args.seed)
     folder = make_folder(args.out, "policy_gradient")
     prepare_process()
     env = make_vector_env(CONFIG, args.envs, sensors=SENSORS, **CHANGES)

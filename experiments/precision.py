@@ -593,7 +593,7 @@ def main(argv: list[str] | None = None) -> int:
     cases = [case for case in CASES if not options.only or options.only in case.name]
     if not cases:
         names = "; ".join(case.name for case in CASES)
-        raise InputError(f"--only: expected part of one of: {names}; found {options.only!r}")
+        raise InputError("--only", f"part of one of: {names}", repr(options.only))
     if options.quick:
         cases = [replace(case, mjx=False) for case in cases if case.robot == "spider"][:2]
     place = RESULTS if options.results else make_folder(options.out, "precision")

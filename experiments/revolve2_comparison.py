@@ -120,7 +120,7 @@ def run_revolve2(python: Path, asked: dict[str, Any]) -> dict[str, Any]:
     try:
         done = subprocess.run(command, input=json.dumps(asked), capture_output=True, text=True)
     except OSError as error:
-        raise InputError(f"--python {python}: expected a Python; found {error.strerror}") from None
+        raise InputError(f"--python {python}", "a Python", error.strerror) from None
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
         raise InputError(f"--python {python}: expected one that has revolve2 1.2.4; found: {last}")

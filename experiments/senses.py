@@ -188,7 +188,7 @@ def main(argv: list[str] | None = None) -> int:
         if scores := score_champions(some):
             found[name] = some, scores
     if not found:
-        raise InputError("--report: expected runs that are finished; found none")
+        raise InputError("--report", "runs that are finished", "none")
     rows = write_report(folder, found)
     for row in rows:
         gained = f"{row['difference']['text']} more than `{row['best_open']}`"

@@ -57,7 +57,7 @@ def evolve(name: str, folder: Path, seed: int, cache: Path) -> dict[str, Any]:
         _, status, used = os.wait4(process.pid, 0)  # its own use, and its workers'
         process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
-        raise InputError(f"{name}: expected exit code 0 of evolve; found {process.returncode}")
+        raise InputError(name, "exit code 0 of evolve", process.returncode)
     reader = RunReader(folder)
     champion, metrics = reader.load_champion(), reader.load_metrics()
     passport = folder / "champion" / "passport.yaml"
@@ -118,7 +118,7 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     names = options.only.split(",")
     if unknown := [name for name in names if name not in NAMES]:
-        raise InputError(f"--only: expected any of {', '.join(NAMES)}; found {unknown[0]}")
+        raise InputError("--only", f"any of {', '.join(NAMES)}", unknown[0])
     folder = make_folder(options.out, "shipped").resolve()
     for name in names:
         first = load_config(name).evolution.seed

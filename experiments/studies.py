@@ -124,7 +124,7 @@ def check_finished(plans: Sequence[Plan]) -> None:
     """Raises `InputError` for a finished run of another configuration or of fewer generations."""
     for plan in plans:
         if RunReader(plan.folder).is_finished and next_step(plan) != "finished":
-            raise InputError(f"{plan.name}: expected a run of all generations; found a shorter one")
+            raise InputError(plan.name, "a run of all generations", "a shorter one")
 
 
 def given_settings(options: argparse.Namespace) -> tuple[str, ...]:
@@ -206,7 +206,7 @@ def read_outcomes(
     if lost:
         raise InputError(lost[0])
     if not found:
-        raise InputError("--report: expected runs that are finished; found none")
+        raise InputError("--report", "runs that are finished", "none")
     return found
 
 

@@ -123,7 +123,7 @@ def _lead(
     if path is None and folder is None:
         raise InputError("expected a CONFIG, or --resume DIR; found neither")
     if folder is not None and arguments.out is not None:
-        raise InputError(f"--resume {folder}: expected no --out beside it; found {arguments.out}")
+        raise InputError(f"--resume {folder}", "no --out beside it", arguments.out)
     trust = arguments.trust
     config = _check(arguments, files=make_fitness is None)
     print(plain(f"loading {folder or path}"), flush=True)  # it takes seconds

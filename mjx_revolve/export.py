@@ -96,11 +96,11 @@ def _named_files(arguments: argparse.Namespace) -> dict[str, Path]:
         if name == "controller":
             _check_importable(files[name], label)
         if not files[name].parent.is_dir():
-            raise InputError(f"{label}: expected the folder {files[name].parent}; found none")
+            raise InputError(label, f"the folder {files[name].parent}", "none")
     if arguments.out is None:
         return files
     if files:
-        raise InputError(f"--out: expected a folder or single files; found --{next(iter(files))}")
+        raise InputError("--out", "a folder or single files", f"--{next(iter(files))}")
     check_output_folder(arguments.out)
     return _all_files(Path(arguments.out))
 
@@ -109,8 +109,7 @@ def _check_importable(path: Path, label: str) -> None:
     """Refuses a file that the node beside it could not import."""
     if not path.stem.isidentifier() or keyword.iskeyword(path.stem):
         raise InputError(
-            f"{label}: expected a name that Python can import (letters, digits and _); found "
-            f"{path.stem!r}"
+            label, "a name that Python can import (letters, digits and _)", repr(path.stem)
         )
 
 
@@ -130,7 +129,7 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     files = _named_files(arguments)
     if files and arguments.meshes is not None and files.keys().isdisjoint(("urdf", "sdf")):
-        raise InputError("--meshes: expected --urdf, --sdf or all formats; found neither")
+        raise InputError("--meshes", "--urdf, --sdf or all formats", "neither")
     if not files and Path(arguments.path).is_dir():
         check_place(Path(arguments.path) / "any", arguments.path)
     check_episode_path(arguments.path)
@@ -188,9 +187,7 @@ def _brain_of(episode: Episode) -> Brain:
     from mjx_revolve.formats.brain import champion_brain
 
     if episode.fitness is None or episode.genes is None:
-        raise InputError(
-            "--controller: expected a champion; found a morphology, which has no genes"
-        )
+        raise InputError("--controller", "a champion", "a morphology, which has no genes")
     return champion_brain(episode.fitness, episode.genes)
 
 

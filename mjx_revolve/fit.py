@@ -97,20 +97,17 @@ def main(argv: list[str] | None = None) -> int:
                  "free": a.free != _FREE}  # fmt: skip
         for name in (name for name, value in given.items() if value):
             raise InputError(
-                "--resume: expected --trust alone beside it, as the folder has all else; found "
-                f"{name}"
+                "--resume", "--trust alone beside it, as the folder has all else", name
             )
     if arguments.plan and (arguments.columns or arguments.out or arguments.seed):
-        raise InputError("--plan: expected neither --map, --out nor --seed; found one")
+        raise InputError("--plan", "neither --map, --out nor --seed", "one")
     if arguments.plan and arguments.recordings:
-        raise InputError("--plan: expected a ROBOT and no recordings; found some")
+        raise InputError("--plan", "a ROBOT and no recordings", "some")
     if arguments.resume is None and not arguments.plan and not arguments.recordings:
         raise InputError("expected a RECORDING, or --plan; found neither")
     for name in arguments.recordings:  # before JAX is imported
         if not check_path(name).exists():
-            raise InputError(
-                f"{name}: expected a CSV, an MCAP, a ROS 2 bag or a run folder; found none"
-            )
+            raise InputError(name, "a CSV, an MCAP, a ROS 2 bag or a run folder", "none")
     with Interrupts() as interrupts:
         runtime.prepare_process()
         maps = [x for x in arguments.columns if "=" not in x]

@@ -165,7 +165,7 @@ def main(argv: list[str] | None = None) -> int:
     if arguments.colony:
         kinds = (".mp4", ".gif")
         if arguments.html or arguments.ancestors is not None:
-            raise InputError("--colony: expected neither --html nor --ancestors; found one")
+            raise InputError("--colony", "neither --html nor --ancestors", "one")
     several = arguments.colony or arguments.ancestors is not None
     arguments.size = arguments.size or (_WIDE if arguments.colony else _USUAL)
     name = "colony" if arguments.colony else individual_name(arguments.individual) or "swim"
@@ -241,7 +241,7 @@ def _ancestor_films(arguments: argparse.Namespace, folder: Path | None) -> list[
 
     refuse_world(arguments.world, arguments.modules)
     if folder is None:
-        raise InputError(f"{arguments.path}: expected a run folder, for --ancestors; found none")
+        raise InputError(arguments.path, "a run folder, for --ancestors", "none")
     number = arguments.individual
     read_individuals(folder, [])  # refuses runs in which no bodies evolve
     number = champion_number(folder) if number is None else number

@@ -71,7 +71,7 @@ def _named_page(arguments: argparse.Namespace, usual: Path) -> Path:
         return path
     path = check_name(arguments.out, PAGES, f"--out {arguments.out}")
     if not path.parent.is_dir():
-        raise InputError(f"--out {path}: expected the folder {path.parent}; found none")
+        raise InputError(f"--out {path}", f"the folder {path.parent}", "none")
     check_place(path, f"--out {path}")
     return path
 
@@ -81,14 +81,12 @@ def _report_sweep(sweep: str, arguments: argparse.Namespace) -> int:
     from mjx_revolve.view.report.sweep import write_report
 
     if len(arguments.runs) > 1:
-        raise InputError(
-            f"{sweep}: expected nothing beside a sweep; found {len(arguments.runs)} folders"
-        )
+        raise InputError(sweep, "nothing beside a sweep", f"{len(arguments.runs)} folders")
     for option, value in (
         ("every-champion", arguments.every_champion), ("individuals", arguments.individuals)
     ):  # fmt: skip
         if value:
-            raise InputError(f"--{option}: expected run folders; found the sweep {sweep}")
+            raise InputError(f"--{option}", "run folders", f"the sweep {sweep}")
     report = write_report(sweep, _named_page(arguments, Path(sweep)))
     for line in report.lost:
         print(f"warning: {line}", file=sys.stderr)
@@ -134,7 +132,7 @@ def _report(arguments: argparse.Namespace) -> int:
     path = _named_page(arguments, folder if len(arguments.runs) == 1 else Path("."))
     which = arguments.individuals
     if isinstance(which, list) and len(records) > 1:
-        raise InputError(f"--individuals: expected numbers of one run; found {len(records)} runs")
+        raise InputError("--individuals", "numbers of one run", f"{len(records)} runs")
     chosen = [(r, choose_individuals(r, which)) for r in records] if which is not None else []
     for record, numbers in chosen:
         written = write_pages(record, numbers)

@@ -181,9 +181,9 @@ def replace_module(
     if homeless and not drop_children:
         slots = ", ".join(map(str, sorted(new.kind.slots))) or "none"
         raise InputError(
-            f"{place}.type: expected one with the slot {tree[homeless[0]].slot} of "
-            f"{tree[homeless[0]].name!r}; found {new.type} with the slots {slots} "
-            "(drop_children removes what does not fit)"
+            f"{place}.type",
+            f"one with the slot {tree[homeless[0]].slot} of {tree[homeless[0]].name!r}",
+            f"{new.type} with the slots {slots} (drop_children removes what does not fit)",
         )
     for child in reversed(homeless):
         tree = _splice(tree, child, [])
@@ -300,9 +300,7 @@ def _find(body: Morphology, module: str | int, core: bool = True) -> int:
             f"{len(names) - 1}; found {show(module)}"
         )
     if index == 0 and not core:
-        raise InputError(
-            f"{_place(body, 0)}: expected a module that is attached to another one; found the core"
-        )
+        raise InputError(_place(body, 0), "a module that is attached to another one", "the core")
     return int(index)
 
 
@@ -313,8 +311,7 @@ def _find_slot(body: Morphology, parent: str | int, slot: int) -> tuple[int, int
     for module in body.modules:
         if (module.parent, module.slot) == (index, at):
             raise InputError(
-                f"{_place(body, index)}: expected a free slot; found slot {at} taken by "
-                f"{module.name!r}"
+                _place(body, index), "a free slot", f"slot {at} taken by {module.name!r}"
             )
     return index, at
 
@@ -404,7 +401,7 @@ def _finish(
 ) -> Morphology:
     """The edited body, checked; modules that did not move need no comparison with each other."""
     if len(modules) > MAX_MODULES:
-        raise InputError(f"{place}: expected at most {MAX_MODULES} modules; found {len(modules)}")
+        raise InputError(place, f"at most {MAX_MODULES} modules", len(modules))
     check_rigid(modules, place)
     before = {(id(m.position), id(m.kind)) for m in body.modules}
     moved = [i for i, m in enumerate(modules) if (id(m.position), id(m.kind)) not in before]

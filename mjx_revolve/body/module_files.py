@@ -67,7 +67,7 @@ def read_modules(data: object, usual: Mapping[str, ModuleType]) -> dict[str, Mod
         kind = _read_type(name, item, usual, place)
         for key in (kind.name, *kind.aliases):
             if key in kinds:
-                raise InputError(f"{place}: expected each name and alias once; found {key} twice")
+                raise InputError(place, "each name and alias once", f"{key} twice")
             kinds[key] = kind
     return kinds
 
@@ -96,7 +96,7 @@ def _read_type(name: str, item: object, usual: Mapping[str, ModuleType], place: 
 
 def _read_part(item: dict[str, Any], index: int, place: str) -> Part:
     if ("size" in item) == ("boxes" in item):
-        raise InputError(f"{place}: expected one of size and boxes; found both or neither")
+        raise InputError(place, "one of size and boxes", "both or neither")
     rest = {key: value for key, value in item.items() if key not in ("size", "boxes")}
     if "size" in item:
         boxes = (read(Box, {"size": item["size"]}, place),)
@@ -112,9 +112,7 @@ def _read_part(item: dict[str, Any], index: int, place: str) -> Part:
 def _read_face(text: str, part: Part, place: str) -> tuple[Vector, Vector]:
     """Centre of a level face of a part's main box, module frame [m], and its outward normal."""
     if not re.fullmatch(r"[-+]?[xy]", text):
-        raise InputError(
-            f"{place}: expected -x, +x, -y, +y or a mapping with position; found {show(text)}"
-        )
+        raise InputError(place, "-x, +x, -y, +y or a mapping with position", show(text))
     normal, position = [0.0, 0.0, 0.0], list(part.position)
     axis = "xy".index(text[-1])
     normal[axis] = -1.0 if text[0] == "-" else 1.0

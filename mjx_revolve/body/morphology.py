@@ -74,7 +74,7 @@ def load_morphology(
     path = find_shipped(path, "morphologies")
     data = load_yaml(path)
     if data is None:
-        raise InputError(f"{path}: expected a mapping with id, body and brain; found an empty file")
+        raise InputError(path, "a mapping with id, body and brain", "an empty file")
     return replace(_make(data, modules, allow_overlap, path.stem, str(path)), path=str(path))
 
 
@@ -145,14 +145,12 @@ def _make(
 ) -> Morphology:
     """The body of a whole mapping; `name` where it has no `id`."""
     if not isinstance(data, dict):
-        raise InputError(
-            f"{source}: expected a mapping with id, body and brain; found {show(data)}"
-        )
+        raise InputError(source, "a mapping with id, body and brain", show(data))
     if "task" in data and "body" not in data:
-        raise InputError(f"{source}: expected a robot; found a configuration")
+        raise InputError(source, "a robot", "a configuration")
     _check_known(data, ("id", "body", "sensors", "brain", "coefficients"), source)
     if "body" not in data:
-        raise InputError(f"{source}: expected the key body; found {show(list(data))}")
+        raise InputError(source, "the key body", show(list(data)))
     tree = _read_tree(data["body"], modules, source)
     if (named := data.get("coefficients")) is not None:
         named = read(_File, named, f"{source}: coefficients")
@@ -178,7 +176,7 @@ def _read_sensors(value: object, source: str) -> tuple[Sensor, ...] | None:
 def _check_known(item: Mapping[object, object], known: tuple[str, ...], place: str) -> None:
     for key in item:
         if key not in known:
-            raise InputError(f"{place}: expected only {', '.join(known)}; found {show(key)}")
+            raise InputError(place, f"only {', '.join(known)}", show(key))
 
 
 def _read_tree(body: object, modules: Mapping[str, ModuleType], source: str) -> tuple[Module, ...]:
@@ -189,7 +187,7 @@ def _read_tree(body: object, modules: Mapping[str, ModuleType], source: str) -> 
         item, where, parent, slot = stack.pop()
         place = f"{source}: {where}"
         if len(found) == MAX_MODULES:
-            raise InputError(f"{source}: body: expected at most {MAX_MODULES} modules; found more")
+            raise InputError(f"{source}: body", f"at most {MAX_MODULES} modules", "more")
         index = len(found)
         module = read_module(item, place, modules, found, parent, slot)
         found.append(module)
@@ -226,14 +224,13 @@ def read_module(
     """
     if not isinstance(item, dict):
         found = "nothing" if item is None else show(item)
-        raise InputError(f"{place}: expected a module (a mapping with a type); found {found}")
+        raise InputError(place, "a module (a mapping with a type)", found)
     _check_known(item, _MODULE_KEYS, place)
     kind = _read_type(item.get("type"), place, modules, parent < 0)
     orientation = read_orientation(item.get("orientation"), f"{place}.orientation")
     if parent < 0 and orientation != 0.0:
         raise InputError(
-            f"{place}.orientation: expected 0 (the core is attached to nothing); "
-            f"found {orientation:g}"
+            f"{place}.orientation", "0 (the core is attached to nothing)", f"{orientation:g}"
         )
     rgb, params = _read_params(item.get("params"), f"{place}.params")
     try:
@@ -286,7 +283,7 @@ def _read_children(item: dict[str, Any], place: str, module: Module) -> dict[int
     for key, child in children.items():
         number = read_slot(key, module.kind, place)
         if number in found:
-            raise InputError(f"{place}: expected each slot once; found slot {number} twice")
+            raise InputError(place, "each slot once", f"slot {number} twice")
         found[number] = child
     return found
 
@@ -317,7 +314,7 @@ def read_slot(value: object, kind: ModuleType, place: str) -> int:
         wanted = f"none, since type {kind.name} has no slots"
     elif number == 0 and 0 not in kind.slots:
         wanted += " (slot 0 is where it is attached)"
-    raise InputError(f"{place}: expected {wanted}; found {show(value)}")
+    raise InputError(place, wanted, show(value))
 
 
 def _read_id(value: object, place: str) -> str:
@@ -332,10 +329,10 @@ def _read_id(value: object, place: str) -> str:
     try:
         name = str(value)
     except ValueError:
-        raise InputError(f"{place}: expected a name or a number; found {show(value)}") from None
+        raise InputError(place, "a name or a number", show(value)) from None
     # Names appear in XML, HTML pages and terminals; line breaks and tabs are safe in all of them.
     if not name.replace("\n", "").replace("\t", "").isprintable():
-        raise InputError(f"{place}: expected printable characters; found {show(value)}")
+        raise InputError(place, "printable characters", show(value))
     return name
 
 
@@ -357,7 +354,7 @@ def read_orientation(value: object, place: str) -> float:
     angle, known = read_number(value), (0, 90, 180, 270, -90, -180, -270)
     number = isinstance(angle, int | float | np.integer) and not isinstance(angle, bool)
     if not number or angle not in known:
-        raise InputError(f"{place}: expected 0, 90, 180, 270 or -90 [deg]; found {show(value)}")
+        raise InputError(place, "0, 90, 180, 270 or -90 [deg]", show(value))
     return float(angle)
 
 
@@ -368,15 +365,13 @@ def _read_params(
     if params is None:
         return None, {}
     if not isinstance(params, dict):
-        raise InputError(f"{place}: expected a mapping; found {show(params)}")
+        raise InputError(place, "a mapping", show(params))
     rest = check_overrides(copy.deepcopy(params), place)
     levels = {key: rest.pop(key) for key in COLORS if key in rest}
     if not levels:
         return None, rest
     if len(levels) < 3:
-        raise InputError(
-            f"{place}: expected red, green and blue, or none; found {', '.join(levels)} only"
-        )
+        raise InputError(place, "red, green and blue, or none", f"{', '.join(levels)} only")
     return (levels["red"], levels["green"], levels["blue"]), rest
 
 

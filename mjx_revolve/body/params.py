@@ -119,9 +119,7 @@ def check_overrides(params: Mapping[str, object], place: str) -> dict[str, Any]:
         if isinstance(key, str) and key not in PARAMS:
             near = difflib.get_close_matches(key.strip().lower(), PARAMS, n=1, cutoff=_SIMILARITY)
             if near:
-                raise InputError(
-                    f"{place}: expected {near[0]}, or a key less like it; found {show(key)}"
-                )
+                raise InputError(place, f"{near[0]}, or a key less like it", show(key))
     return {
         key: read(PARAMS[key], value, f"{place}.{key}") if key in PARAMS else value
         for key, value in params.items()
@@ -179,13 +177,13 @@ def apply_overrides(kind: ModuleType, params: Mapping[str, Any]) -> ModuleType:
     if "fossen" in params:
         if len(parts) > 1:
             raise InputError(
-                f"fossen: expected a module with one part; found type {kind.name} with {len(parts)}"
+                "fossen", "a module with one part", f"type {kind.name} with {len(parts)}"
             )
         changes[0]["fossen"] = read(Fossen, params["fossen"], "fossen")
     if "thruster" in params or "thrust" in params:
         if not kind.is_thruster:
             key = "thruster" if "thruster" in params else "thrust"
-            raise InputError(f"{key}: expected a module with a thruster; found type {kind.name}")
+            raise InputError(key, "a module with a thruster", f"type {kind.name}")
         for part, change in zip(parts, changes, strict=True):
             if part.thruster is not None:
                 change["thruster"] = _change_thruster(part.thruster, params)

@@ -87,9 +87,7 @@ def _make(name: str, plant: Plant, settings: Any) -> Controller:
 def _make_brain(plant: Plant, settings: Any, source: str, body: Morphology | None) -> Controller:
     """The controller under `brain` in the robot's file."""
     if body is None:
-        raise InputError(
-            f"{source}: controller.type: expected another one, as bodies differ; found 'brain'"
-        )
+        raise InputError(f"{source}: controller.type", "another one, as bodies differ", "'brain'")
     brain, file = body.brain, body.path or body.name
     if isinstance(brain, Mapping) and "neurons" in brain:
         for name in CONTROLLERS["brain"].settings:
@@ -107,17 +105,17 @@ def _make_brain(plant: Plant, settings: Any, source: str, body: Morphology | Non
     if kind == "bo-cpg":
         known += " (its oscillators are those of controller.type cpg)"
     found = "none" if brain is None else show(brain if kind is None else kind)
-    raise InputError(f"{file}: brain: expected {known}; found {found}")
+    raise InputError(f"{file}: brain", known, found)
 
 
 def _check_users_controller(name: str, controller: object, plant: Plant) -> None:
     """Raises `InputError` unless a user's function made a controller of the plant."""
     place = function_place(name)
     if not isinstance(controller, Controller):
-        raise InputError(f"{place}: expected a Controller; found {type(controller).__name__}")
+        raise InputError(place, "a Controller", type(controller).__name__)
     count = controller.num_genes
     if not isinstance(count, int) or count < 0:
-        raise InputError(f"{place}: num_genes: expected a whole number >= 0; found {count!r}")
+        raise InputError(f"{place}: num_genes", "a whole number >= 0", repr(count))
     if len(controller.gene_names) != count:
         raise InputError(
             f"{place}: gene_names: expected {count} of them, as num_genes says; found "

@@ -343,13 +343,13 @@ def _find_inputs(
         name = neuron.part_id
         where = f"{place}.neurons.{neuron.id}.part_id"
         if name not in modules:
-            raise InputError(f"{where}: expected a module's id; found {show(neuron.part_id)}")
+            raise InputError(where, "a module's id", show(neuron.part_id))
         module, number = body.modules[modules[name]], seen[name]
         seen[name] += 1
         most = _INERTIAL if module.parent < 0 else _CELLS if module.kind.sensor else 0
         if number >= most:
             has = f"a module with {number + 1} inputs (a core has 6, a touch sensor 2, others none)"
-            raise InputError(f"{where}: expected {has}; found {name!r} of type {module.type}")
+            raise InputError(where, has, f"{name!r} of type {module.type}")
         what = (f"at {name}", number)
         if module.parent < 0:
             what = ("force", number) if number < 3 else ("angular_velocity", number - 3)

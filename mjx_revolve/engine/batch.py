@@ -710,7 +710,7 @@ def pack_bodies(
 def assemble_all(robots: Sequence[Robot]) -> Assembly:
     """Robots of one world, one behind the other."""
     if not robots:
-        raise InputError("robots: expected at least one; found none")
+        raise InputError("robots", "at least one", "none")
     for robot in robots:
         if robot.as_edited().edited_model is not None:
             raise InputError(
@@ -788,9 +788,7 @@ def _check_fit(
     ):
         if np.any(counts > most):
             k = int(np.argmax(counts > most))
-            raise InputError(
-                f"robot {names[k]!r}: expected at most {most} {what}; found {counts[k]}"
-            )
+            raise InputError(f"robot {names[k]!r}", f"at most {most} {what}", counts[k])
     if drags_whole_bodies(assembly.world.drag) and np.any(order.overflow):
         k = int(np.argmax(order.overflow))
         raise InputError(
@@ -820,8 +818,7 @@ def _check_shells(
     most = int(np.bincount(robot, minlength=1).max())
     if most > capacity.meetings:
         raise InputError(
-            f"robots: expected at most {capacity.meetings} pairs of boxes that can meet; found "
-            f"{most}"
+            "robots", f"at most {capacity.meetings} pairs of boxes that can meet", most
         )
 
 
@@ -845,9 +842,9 @@ def _leave_out(level: Level, constant: Level, names: list[str], real: Any) -> Le
             place = next(jax.tree_util.keystr(path) for path, leaf in leaves if leaf is x)
             which = np.unravel_index(int(np.argmax(wrong)), wrong.shape)
             raise InputError(
-                f"robot {names[which[-1]]!r}: {place.lstrip('.')}: expected {same:g}, as in all "
-                "bodies of the types of modules that there is room for; found "
-                f"{float(x[which]):g}"
+                f"robot {names[which[-1]]!r}: {place.lstrip('.')}",
+                f"{same:g}, as in all bodies of the types of modules that there is room for",
+                f"{float(x[which]):g}",
             )
         return None
 

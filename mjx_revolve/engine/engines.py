@@ -152,4 +152,4 @@ def _make_engine(robot: Robot, engine: str, contact: bool) -> Engine[Any]:
         from mjx_revolve.engine.mjx_engine import make_mjx_engine
 
         return make_mjx_engine(robot, contact)
-    raise InputError(f"engine: expected one of {', '.join(ENGINES)}; found {engine!r}")
+    raise InputError("engine", f"one of {', '.join(ENGINES)}", repr(engine))

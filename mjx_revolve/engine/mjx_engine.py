@@ -144,7 +144,7 @@ class MjxEngine:
         Raises:
             InputError: always.
         """
-        raise InputError("engine: expected 'population' for other coefficients; found 'mjx'")
+        raise InputError("engine", "'population' for other coefficients", "'mjx'")
 
     def init(self, qpos: Float[Array, "nq lanes"], qvel: Float[Array, "nv lanes"]) -> MjxState:
         """The state of a population, thrusters at rest."""

@@ -299,7 +299,7 @@ def _own_genes(life: LoggedIndividual, count: int) -> np.ndarray:
     genes = life.genes
     if genes is None or len(genes) != count:
         found = "none: every trial of its life failed" if genes is None else str(len(genes))
-        raise InputError(f"individual {life.number}: genes: expected {count}; found {found}")
+        raise InputError(f"individual {life.number}: genes", count, found)
     return genes
 
 

@@ -566,7 +566,7 @@ def make_config(
         InputError: a key is unknown or missing, a value is out of bounds, or a file is missing.
     """
     if not isinstance(data, Mapping):
-        raise InputError(f"{source}: expected a mapping; found {show(data)}")
+        raise InputError(source, "a mapping", show(data))
     settings, label = read_overrides(overrides)
     merged = copy_plain(data)
     for key, value in settings.items():
@@ -613,7 +613,7 @@ def _resolve(file: NamedFile, folder: Path, before: str) -> str:
         path = check_path(os.path.abspath(found))
     if not path.is_file():
         what = "a folder" if path.is_dir() else "none"
-        raise InputError(f"{place}: expected a file; found {what} at {short_path(path)}")
+        raise InputError(place, "a file", f"{what} at {short_path(path)}")
     return file.at(path)
 
 
@@ -638,9 +638,9 @@ def load_config(path: str | Path, overrides: Mapping[str, object] | Sequence[str
     data = load_yaml(path)
     if not isinstance(data, dict):
         found = "an empty file" if data is None else show(data)
-        raise InputError(f"{short_path(path)}: expected a mapping of settings; found {found}")
+        raise InputError(short_path(path), "a mapping of settings", found)
     if "body" in data and "task" not in data:
-        raise InputError(f"{short_path(path)}: expected a configuration; found a robot")
+        raise InputError(short_path(path), "a configuration", "a robot")
     if is_run_config(path):
         data = locate_files(data, find_copies(Path(os.path.abspath(path.parent))))
         data = with_older_values(data, path.parent)

@@ -54,10 +54,6 @@ def refuse_world(world: str | None, modules: str | Path | None = None) -> None:
         InputError: there is one.
     """
     if world is not None:
-        raise InputError(
-            f"world: expected none: a champion swims in the world it evolved in; found {world!r}"
-        )
+        raise InputError("world", "none: a champion swims in the world it evolved in", repr(world))
     if modules is not None:
-        raise InputError(
-            f"modules: expected none: a run's configuration names its own; found {str(modules)!r}"
-        )
+        raise InputError("modules", "none: a run's configuration names its own", repr(str(modules)))

@@ -281,13 +281,12 @@ def make_environment(
     config, body = fitness.config, fitness.robot.morphology
     if config.engine != "population":
         raise InputError(
-            f"{config.source}: engine: expected population, to step environments; found "
-            f"{config.engine}"
+            f"{config.source}: engine", "population, to step environments", config.engine
         )
     plant = fitness.engine.plant
     if plant.num_actuators == 0:
         raise InputError(
-            f"{config.source}: morphology: expected a hinge or a thruster to act with; found none"
+            f"{config.source}: morphology", "a hinge or a thruster to act with", "none"
         )
     every = _period(control_rate, fitness.record_every, fitness.world.timestep)
     declared = config.controller.sensors
@@ -303,8 +302,7 @@ def make_environment(
     names = (*observer.robot_names, *joints)
     if not names:
         raise InputError(
-            f"{config.source}: controller.sensors: expected some that this robot can have; found "
-            "none"
+            f"{config.source}: controller.sensors", "some that this robot can have", "none"
         )
     return Environment(fitness, observer, every, names, plant.names)
 

@@ -200,7 +200,7 @@ class EpisodeSpec(ABC, Generic[B]):
                 "so that there are no genes to evolve"
             )
         wanted = " or ".join(f"[{'B, ' * (rank - 2)}P, {count}]" for rank in ranks)
-        raise InputError(f"population: expected {wanted}; found {list(shape)}")
+        raise InputError("population", wanted, list(shape))
 
     def make_rollout(
         self,

@@ -297,7 +297,7 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
         genes = genes if isinstance(genes, jax.Array) else np.asarray(genes)
         indices = self._indices(robot)
         if genes.shape[-1] != len(indices):
-            raise InputError(f"genes: expected [..., {len(indices)}]; found {list(genes.shape)}")
+            raise InputError("genes", f"[..., {len(indices)}]", list(genes.shape))
         shape = (*genes.shape[:-1], self.num_genes)
         if isinstance(genes, jax.Array):
             return jnp.zeros(shape, genes.dtype).at[..., indices].set(genes)
@@ -349,7 +349,7 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
         if single:
             population = population[None]
         if count != len(population):
-            raise InputError(f"robots: expected {len(population)}, one each; found {count}")
+            raise InputError("robots", f"{len(population)}, one each", count)
         bodies = robots if isinstance(robots, PackedBodies) else self.pack(robots)
         found = self.program(population, key)(bodies, population, key)
         return jax.tree.map(lambda x: x[0], found) if single else found
@@ -467,18 +467,16 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
         """Tables of the bodies, for many evaluations of the same ones."""
         for robot in robots:
             if not isinstance(robot, Robot):
-                raise InputError(
-                    f"robots: expected what `build` returns; found {type(robot).__name__}"
-                )
+                raise InputError("robots", "what `build` returns", type(robot).__name__)
         bodies = pack_bodies(robots, self.capacity)
         if not self.touches:
             reach = max_distance(self.settings, self.world, bodies.figure)
             k = int(np.argmax(reach))
             if may_touch_bed(self.task, self.settings, self.world, reach[k]):
                 raise InputError(
-                    f"robot {robots[k].morphology.name!r}: expected a body that cannot reach the "
-                    "bed, as the examples cannot; found one that may (give one like it as an "
-                    "example)"
+                    f"robot {robots[k].morphology.name!r}",
+                    "a body that cannot reach the bed, as the examples cannot",
+                    "one that may (give one like it as an example)",
                 )
         return bodies
 
@@ -592,15 +590,13 @@ def make_mixed_fitness(
     """
     config = _read(config, overrides)
     if config.engine != "population":
-        raise InputError(
-            f"{config.source}: engine: expected population, as bodies differ; found {config.engine}"
-        )
+        raise InputError(f"{config.source}: engine", "population, as bodies differ", config.engine)
     world, task = _place(config)
     robots = [_build(config, world, morphology) for morphology in examples]
     for robot in robots:
         check_timestep(robot)
     if not robots:
-        raise InputError("examples: expected at least one morphology; found none")
+        raise InputError("examples", "at least one morphology", "none")
     figures = [body_geometry(robot) for robot in robots]
     if modules:  # no body is longer than this, and one sinks only if one of its types does
         types = [*(m.kind for robot in robots for m in robot.morphology.modules), *kinds]
@@ -720,8 +716,7 @@ def _build(config: Config, world: World, morphology: Morphology) -> Robot:
     if config.trim == "neutral":
         if world.density == 0:
             raise InputError(
-                f"{config.source}: trim: expected none, as water of density 0 carries nothing; "
-                "found neutral"
+                f"{config.source}: trim", "none, as water of density 0 carries nothing", "neutral"
             )
         morphology = trim_neutral(morphology, world.density)
     return build_robot(morphology, world)

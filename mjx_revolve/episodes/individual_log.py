@@ -174,12 +174,12 @@ def find_individuals(folder: Path, numbers: Sequence[int]) -> list[LoggedIndivid
     """
     path = folder / INDIVIDUALS
     if not path.is_file():
-        raise InputError(f"{path}: expected the log of the run's individuals; found no such file")
+        raise InputError(path, "the log of the run's individuals", "no such file")
     known, _ = read_individuals(folder)
     for number in numbers:
         if number not in known:
             found = f"those from {min(known)} to {max(known)}" if known else "none at all"
-            raise InputError(f"{path}: expected individual {number}; found {found}")
+            raise InputError(path, f"individual {number}", found)
     return [known[number] for number in numbers]
 
 

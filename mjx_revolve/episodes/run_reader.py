@@ -40,7 +40,7 @@ def find_run(path: str | Path) -> Path:
         folder = folder.parent
     check_no_sweep(folder)
     if not (folder / "config.yaml").is_file():
-        raise InputError(f"{path}: expected a run folder; found no config.yaml in it")
+        raise InputError(path, "a run folder", "no config.yaml in it")
     return folder
 
 
@@ -53,11 +53,11 @@ def check_runs(names: Sequence[str | Path]) -> None:
     for name in names:
         if not check_path(name).is_dir():
             found = "a file" if Path(name).exists() else "none"
-            raise InputError(f"{name}: expected a run folder; found {found}")
+            raise InputError(name, "a run folder", found)
     files = ("config.yaml", "run.json", "metrics.csv", "champion", SWEEP)
     folders = [f for f in map(Path, names) for f in (f, f.parent)]
     if not any((folder / file).exists() for folder in folders for file in files):
-        raise InputError(f"{names[0]}: expected a run folder; found nothing of a run")
+        raise InputError(names[0], "a run folder", "nothing of a run")
 
 
 @dataclass
@@ -80,7 +80,7 @@ class RunReader:
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: expected JSON; found: {error}") from None
         if not isinstance(info, dict):
-            raise InputError(f"{path}: expected a JSON object; found {type(info).__name__}")
+            raise InputError(path, "a JSON object", type(info).__name__)
         return info
 
     @property
@@ -196,7 +196,7 @@ def load_metrics(path: str | Path) -> dict[str, np.ndarray]:
     """
     path = check_path(path)
     if not path.is_file():
-        raise InputError(f"{path}: expected a file; found none")
+        raise InputError(path, "a file", "none")
     columns, bad, damage = read_metrics(path)
     if damage or bad:
         found = damage or f"expected a number in every cell; found {bad} damaged lines"
@@ -315,12 +315,10 @@ class ChampionRecord:
         """The run's configuration; raises `InputError` if there is no such file."""
         named = self.facts.get("config", "../config.yaml")
         if not isinstance(named, str):
-            raise InputError(f"{self.path}: config: expected a path; found {named!r}")
+            raise InputError(f"{self.path}: config", "a path", repr(named))
         source = self.path.parent / named
         if not source.is_file():
-            raise InputError(
-                f"{self.path}: config: expected the run's config.yaml; found no {source}"
-            )
+            raise InputError(f"{self.path}: config", "the run's config.yaml", f"no {source}")
         return load_config(source, overrides)
 
     def load_config(self, **overrides: object) -> Config:
@@ -343,9 +341,7 @@ class ChampionRecord:
     def check_genes(self, count: int, named: str) -> None:
         """Refuses genes that are not as many as `named`, a configuration or robot, takes."""
         if len(self.genes) != count:
-            raise InputError(
-                f"{self.path}: genes: expected {count}, as {named} has it; found {len(self.genes)}"
-            )
+            raise InputError(f"{self.path}: genes", f"{count}, as {named} has it", len(self.genes))
 
 
 def read_champion(path: Path) -> ChampionRecord:

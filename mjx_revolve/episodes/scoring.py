@@ -142,7 +142,7 @@ def pick_near(choices: Mapping[int, float], wanted: object, place: str, unit: st
             if abs(known - wanted) < 1e-3 * known:
                 return key
     shown = ", ".join(f"{known:.4g}" for known in choices.values())
-    raise InputError(f"{place}: expected one of {shown} {unit}; found {wanted!r}")
+    raise InputError(place, f"one of {shown} {unit}", repr(wanted))
 
 
 def average_trials(scores: Scores, trials: int) -> tuple[jax.Array, dict[str, jax.Array]]:

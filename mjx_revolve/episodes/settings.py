@@ -223,9 +223,7 @@ def find_copies(folder: Path) -> dict[str, Path]:
         path = resolve_inside(name, folder)
         # A missing one is reported where it is used.
         if path.is_file() and hashlib.sha256(read_file(path)).hexdigest() != digest:
-            raise InputError(
-                f"{folder / name}: expected the file that the run began with; found it changed"
-            )
+            raise InputError(folder / name, "the file that the run began with", "it changed")
         found[name] = folder / name
     return found
 

@@ -188,15 +188,11 @@ def simulate(
     if isinstance(ctrl, BoundController):
         controller, drive_input = ctrl.controller, _array("genes", ctrl.genes, (-1,))
         if drive_input.shape[0] != controller.num_genes:
-            raise InputError(
-                f"genes: expected {controller.num_genes} numbers; found {drive_input.shape[0]}"
-            )
+            raise InputError("genes", f"{controller.num_genes} numbers", drive_input.shape[0])
     elif ctrl is not None and not callable(ctrl):
         rows = _array("ctrl", ctrl, None)
         if rows.ndim not in (1, 2) or rows.shape[-1] != model.nu:
-            raise InputError(
-                f"ctrl: expected [{model.nu}] or [T, {model.nu}]; found {list(rows.shape)}"
-            )
+            raise InputError("ctrl", f"[{model.nu}] or [T, {model.nu}]", list(rows.shape))
     steps = _steps(rows, duration, dt)
     if controller is None:
         if ctrl is None:
@@ -204,7 +200,7 @@ def simulate(
         elif callable(ctrl):
             rows = jax.vmap(lambda t: jnp.asarray(ctrl(t)))(dt * jnp.arange(steps))
         if rows.shape[-1] != model.nu:
-            raise InputError(f"ctrl: expected {model.nu} targets; found {rows.shape[-1]}")
+            raise InputError("ctrl", f"{model.nu} targets", rows.shape[-1])
         drive_input = jnp.broadcast_to(rows, (steps, model.nu))
     if qpos is None:
         qpos = robot.start_qpos()
@@ -226,14 +222,14 @@ def simulate(
         water = jax.tree.map(lambda x: _array("water", x, None), water)
         for leaf in jax.tree.leaves(water):
             if leaf.ndim > 1 or (leaf.ndim == 1 and leaf.shape[0] not in (1, steps)):
-                raise InputError(f"water: expected numbers or [{steps}]; found {list(leaf.shape)}")
+                raise InputError("water", f"numbers or [{steps}]", list(leaf.shape))
     if context is None:
         noise = noise_key(jax.random.key(0) if key is None else key)
         context = EpisodeContext(noise=jax.random.bits(noise, (), "uint32"))
     context = jax.tree.map(jnp.asarray, context)
     if variation is not None:
         if engine != "population":
-            raise InputError(f"variation: expected none, as engine is {engine}; found some")
+            raise InputError("variation", f"none, as engine is {engine}", "some")
         variation = Variation(*(_array("variation", x, ()) for x in variation))
     jitted, plain = _compiled(robot, engine, steps, controller, water is None, once)
     given = qpos, qvel, drive_input, water, context, variation
@@ -247,7 +243,7 @@ def _steps(rows: Any, duration: float | None, dt: float) -> int:
         or not np.isfinite(duration)
         or duration <= 0
     ):
-        raise InputError(f"duration: expected seconds > 0; found {duration!r}")
+        raise InputError("duration", "seconds > 0", repr(duration))
     if rows is not None and rows.ndim == 2:
         steps = rows.shape[0]
         if duration is not None and abs(duration - steps * dt) > dt:
@@ -263,12 +259,12 @@ def _array(place: str, value: ArrayLike, shape: tuple[int, ...] | None) -> jax.A
     try:
         array = jnp.asarray(value, dtype=jnp.result_type(float))
     except (TypeError, ValueError):
-        raise InputError(f"{place}: expected numbers; found {value!r}") from None
+        raise InputError(place, "numbers", repr(value)) from None
     if shape is not None and (
         array.ndim != len(shape)
         or any(n not in (-1, m) for n, m in zip(shape, array.shape, strict=True))
     ):
-        raise InputError(f"{place}: expected shape {list(shape)}; found {list(array.shape)}")
+        raise InputError(place, f"shape {list(shape)}", list(array.shape))
     if not is_traced(array) and not bool(jnp.all(jnp.isfinite(array))):
-        raise InputError(f"{place}: expected finite numbers; found NaN or infinity")
+        raise InputError(place, "finite numbers", "NaN or infinity")
     return array

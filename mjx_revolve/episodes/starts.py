@@ -63,7 +63,7 @@ def check_key(key: object) -> None:
     """
     dtype = getattr(key, "dtype", None)
     if dtype is None or not (jnp.issubdtype(dtype, jax.dtypes.prng_key) or dtype == jnp.uint32):
-        raise InputError(f"key: expected jax.random.key(SEED); found {key!r}")
+        raise InputError("key", "jax.random.key(SEED)", repr(key))
 
 
 def draw_starts(task: TaskConfig, world: World, key: jax.Array, steps: int) -> Starts:

@@ -197,11 +197,11 @@ class Tank:
                 fit.
         """
         if not 0 <= world < self.worlds:
-            raise InputError(f"tank: expected a world below {self.worlds}; found {world}")
+            raise InputError("tank", f"a world below {self.worlds}", world)
         each = self.places // self.worlds
         free = [k for k in range(world * each, (world + 1) * each) if self.robots[k] is None]
         if not free:
-            raise InputError(f"tank: expected a free place; found all {each} taken")
+            raise InputError("tank", "a free place", f"all {each} taken")
         if genes is None:
             wide = np.zeros(self.mixed.num_genes, np.float32)
         else:
@@ -231,7 +231,7 @@ class Tank:
             InputError: the place is empty.
         """
         if not 0 <= place < self.places or self.robots[place] is None:
-            raise InputError(f"tank: expected a robot in place {place}; found none")
+            raise InputError("tank", f"a robot in place {place}", "none")
         self.robots[place] = None
 
     def move(self, shift: np.ndarray) -> None:
@@ -259,7 +259,7 @@ class Tank:
         """
         found = np.asarray(current, np.float32)
         if found.shape != (3,) or not np.all(np.isfinite(found)):
-            raise InputError(f"current: expected three numbers [m/s]; found {list(current)}")
+            raise InputError("current", "three numbers [m/s]", list(current))
         self._current = found
 
     def set_targets(self, target: np.ndarray | None) -> None:
@@ -415,7 +415,7 @@ class Tank:
         """
         alive = arrays["alive"]
         if alive.shape != (self.places,) or set(np.flatnonzero(alive)) != set(robots):
-            raise InputError("tank: expected the arrays of one with these robots; found others")
+            raise InputError("tank", "the arrays of one with these robots", "others")
         for place, robot in robots.items():
             self._put(place, robot)
             self.robots[place] = robot
@@ -427,7 +427,7 @@ class Tank:
             found = [arrays.get(f"passage.{k}") for k in range(len(wanted))]
             for want, have in zip(wanted, found, strict=True):
                 if have is None or have.shape != want.shape or have.dtype != want.dtype:
-                    raise InputError("tank: expected the arrays of one like this; found others")
+                    raise InputError("tank", "the arrays of one like this", "others")
             self.state = jax.tree.unflatten(tree, found)
 
 
@@ -455,9 +455,7 @@ def make_tank(
         InputError: the world is gusty, or its bed may be touched and there is no room for that.
     """
     if mixed.world.gust is not None:
-        raise InputError(
-            "tank: expected a world without gusts, which are drawn for episodes; found some"
-        )
+        raise InputError("tank", "a world without gusts, which are drawn for episodes", "some")
     if mixed.world.bed is not None and not mixed.touches:
         raise InputError(
             "tank: expected a fitness with a colony where there is a bed, which robots reach in a "

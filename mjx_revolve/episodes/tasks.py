@@ -173,7 +173,7 @@ class Task:
         """Checks the fields that users set."""
         for name in self.records:
             if name not in RECORDS:
-                raise InputError(f"records: expected any of {', '.join(RECORDS)}; found {name!r}")
+                raise InputError("records", f"any of {', '.join(RECORDS)}", repr(name))
 
 
 def _keeping(error: jax.Array, tolerance: float) -> jax.Array:

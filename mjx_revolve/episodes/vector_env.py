@@ -212,7 +212,7 @@ def _make_class() -> type:
             given = jnp.asarray(actions, jnp.float32)
             shape = (self.num_envs, len(self.action_names))
             if given.shape != shape:
-                raise InputError(f"actions: expected {list(shape)}; found {list(given.shape)}")
+                raise InputError("actions", list(shape), list(given.shape))
             self._state, seen, outcome, last = self._step(self._state, given)
             self._seen = np.array(seen)
             terminated, truncated = np.array(outcome.terminated), np.array(outcome.truncated)
@@ -280,11 +280,10 @@ def make_vector_env(
     check_package("make_vector_env", "gymnasium")
     whole = isinstance(num_envs, int | np.integer) and not isinstance(num_envs, bool)
     if not whole or num_envs < 1:
-        raise InputError(f"num_envs: expected a whole number >= 1; found {num_envs!r}")
+        raise InputError("num_envs", "a whole number >= 1", repr(num_envs))
     if autoreset_mode not in AUTORESET_MODES:
         raise InputError(
-            f"autoreset_mode: expected one of {', '.join(AUTORESET_MODES)}; found "
-            f"{autoreset_mode!r}"
+            "autoreset_mode", f"one of {', '.join(AUTORESET_MODES)}", repr(autoreset_mode)
         )
     fitness = make_fitness(config, **overrides)
     environment = make_environment(fitness, control_rate, sensors)

@@ -120,7 +120,7 @@ class TruncatedBPTT:
             )
         clock = episodes.rollout.steps
         if not is_traced(clock) and int(clock[0]) >= fitness.num_timesteps:
-            raise InputError("episodes: expected some under way; found their end")
+            raise InputError("episodes", "some under way", "their end")
         run = self._step if is_traced(population, episodes) else self._compiled[1]
         return run(population, episodes)
 
@@ -252,8 +252,7 @@ def make_windows(fitness: Fitness, horizon: float | None = None) -> TruncatedBPT
     config, records = fitness.config, fitness.num_records
     if config.engine != "population":
         raise InputError(
-            f"{config.source}: engine: expected population, to go back through its steps; found "
-            f"{config.engine}"
+            f"{config.source}: engine", "population, to go back through its steps", config.engine
         )
     if config.task.target_turn is not None:
         raise InputError(

@@ -215,10 +215,10 @@ def from_arrays(arrays: Mapping[str, np.ndarray]) -> Archive:
     for name, array in found.items():
         if array.shape != shapes[name] or array.dtype.kind != kinds[name]:
             what = f"{array.dtype} {list(array.shape)}" if name in arrays else "nothing"
-            raise InputError(f"archive.{name}: expected that of an archive; found {what}")
+            raise InputError(f"archive.{name}", "that of an archive", what)
     names, shape = (tuple(found[name].tolist()) for name in ("names", "shape"))
     if shape and (min(shape) < 1 or math.prod(shape) != count):
-        raise InputError(f"archive.shape: expected one of {count} cells; found {list(shape)}")
+        raise InputError("archive.shape", f"one of {count} cells", list(shape))
     return Archive(**found | {"names": names, "shape": shape})
 
 

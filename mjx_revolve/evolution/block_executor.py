@@ -88,9 +88,7 @@ class Executor:
 
         population = np.asarray(population, np.float32)
         if population.ndim != 2 or population.shape[1] != self.num_genes or len(population) < 1:
-            raise InputError(
-                f"population: expected [P, {self.num_genes}]; found {list(population.shape)}"
-            )
+            raise InputError("population", f"[P, {self.num_genes}]", list(population.shape))
         blocks = split_blocks(population, self.block or len(population))
         scores, measures = zip(*self.score([(block,) for block in blocks], key), strict=True)
         size = len(population)

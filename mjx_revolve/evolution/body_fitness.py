@@ -254,6 +254,5 @@ def _load_seed(
 def _check_seeds(bodies: BodiesConfig, genotype: Genotype) -> None:
     if bodies.seeds and genotype.adopt is None:
         raise InputError(
-            f"bodies.seeds: expected none, as no {bodies.name} grows into a given robot; found "
-            f"{len(bodies.seeds)}"
+            "bodies.seeds", f"none, as no {bodies.name} grows into a given robot", len(bodies.seeds)
         )

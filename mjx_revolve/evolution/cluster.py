@@ -155,13 +155,13 @@ class ClusterExecutor(WorkerExecutor[ClusterWorker]):
 
         is_file = place.endswith(".json") or os.path.isfile(place)
         if is_file and not os.path.isfile(place):  # Dask would wait for it
-            raise InputError(f"--cluster: expected a scheduler file; found none at {place}")
+            raise InputError("--cluster", "a scheduler file", f"none at {place}")
         try:
             where = {"scheduler_file" if is_file else "address": place}
             self._client = distributed.Client(**where, set_as_default=False)
         except Exception as error:  # Dask raises anything about addresses, files and TLS
             raise InputError(
-                f"--cluster {place}: expected a Dask scheduler; found {describe_error(error)}"
+                f"--cluster {place}", "a Dask scheduler", describe_error(error)
             ) from None
         self.place = place
         self.workers: dict[str, ClusterWorker] = {}

@@ -120,7 +120,7 @@ class BodyEvolution(IndividualEvolution):
         for place, names in named.items():
             for name in names:
                 if name not in known:
-                    raise InputError(f"{place}: expected any of {', '.join(known)}; found {name!r}")
+                    raise InputError(place, f"any of {', '.join(known)}", repr(name))
 
     def start(self) -> BodySearch:
         """The search before its first generation."""

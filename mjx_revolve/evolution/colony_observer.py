@@ -121,7 +121,7 @@ def open_colony(
     run = RunReader(find_run(folder))
     config = run.load_config()
     if config.colony is None:
-        raise InputError(f"{folder}: expected the run of a colony; found one without")
+        raise InputError(folder, "the run of a colony", "one without")
     fitness = make_body_fitness(config)
     evolution = ColonyEvolution(config, Executor(fitness, fitness.block_size))
     for checkpoint in run.readable_checkpoints({}):
@@ -130,6 +130,5 @@ def open_colony(
         if begin is None or now <= begin + 1e-9:
             return config, fitness, search, now if begin is None else begin
     if begin is None:
-        raise InputError(f"{folder / 'checkpoints'}: expected a checkpoint that is whole; found "
-                         "none")  # fmt: skip
+        raise InputError(folder / "checkpoints", "a checkpoint that is whole", "none")
     return config, fitness, Colony(), begin

@@ -256,9 +256,7 @@ class GeneEvolution:
                     f"{self.config.strategy} of this version has it; found {what}"
                 )
         if not np.array_equal(arrays["root_key"], expected["root_key"]):
-            raise InputError(
-                f"root_key: expected the key of evolution.seed {self.config.seed}; found another"
-            )
+            raise InputError("root_key", f"the key of evolution.seed {self.config.seed}", "another")
         paths, structure = jax.tree_util.tree_flatten_with_path(template.state)
         leaves = [arrays["state" + jax.tree_util.keystr(path)] for path, _ in paths]
         fields: dict[str, Any] = {name: arrays[name].item() for name in _COUNTERS}

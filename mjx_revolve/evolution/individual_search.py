@@ -65,9 +65,7 @@ class IndividualEvolution:
         required = self.fitness.bodies.selection.passport == "required"
         candidates = list_candidates(search, required)
         if not candidates:
-            raise InputError(
-                "champion: expected an individual with a score; found none: all failed"
-            )
+            raise InputError("champion", "an individual with a score", "none: all failed")
 
         def score(indices: Sequence[int], key: jax.Array) -> Scored:
             chosen = [candidates[k] for k in indices]

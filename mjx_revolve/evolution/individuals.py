@@ -155,12 +155,11 @@ def from_record(
             evaluations=int(record.get("evaluations", 0)),  # earlier versions counted none
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"individual: expected a record of one; found {show(error)}") from None
+        raise InputError("individual", "a record of one", show(error)) from None
     grown = genotype.develop(genome)
     if grown.modules != found.body.modules:
         raise InputError(
-            f"individual {found.number}: expected the body that its genome grows into; found "
-            "another one"
+            f"individual {found.number}", "the body that its genome grows into", "another one"
         )
     return replace(found, body=grown)
 
@@ -206,7 +205,7 @@ def reading_state(
     try:
         found = int(arrays["seed"])
         if found != seed:
-            raise InputError(f"seed: expected evolution.seed {seed}; found {found}")
+            raise InputError("seed", f"evolution.seed {seed}", found)
         yield {name: arrays[name].item() for name in counters}
     except InputError:
         raise

@@ -203,9 +203,7 @@ class Run:
         worlds = [(), *((name,) for name in OLDER_WORLD), tuple(OLDER_WORLD)]
         ways = itertools.product((False, True), worlds)
         if known not in {settings_hash(config, *way) for way in ways}:
-            raise InputError(
-                f"{label}: expected the config.yaml that it began with; found it changed"
-            )
+            raise InputError(label, "the config.yaml that it began with", "it changed")
         executor = _prepare(config, make_executor)
         if begun.get("model_hash") != model_hash(executor.fitness):
             raise InputError(

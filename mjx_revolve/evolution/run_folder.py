@@ -185,9 +185,7 @@ class RunFolder(RunReader):
             return replace(checkpoint, damaged=tuple(f"{k} ({v})" for k, v in damaged.items()))
         lines = ", ".join(f"{name} ({why})" for name, why in damaged.items())
         found = f"only damaged ones: {lines}" if damaged else "none"
-        raise InputError(
-            f"{self.path / 'checkpoints'}: expected a checkpoint to resume from; found {found}"
-        )
+        raise InputError(self.path / "checkpoints", "a checkpoint to resume from", found)
 
     def rewind(self, checkpoint: Checkpoint | None) -> None:
         """Removes all later than a checkpoint: metrics, checkpoints, half-written files.
@@ -289,7 +287,7 @@ def load_archive(folder: str | Path) -> tuple[Archive, list[LoggedIndividual]]:
     run = RunFolder(check_path(folder))
     own = arrays_of("archive.", run.load_checkpoint().arrays)
     if not own:
-        raise InputError(f"{folder}: expected a run with bodies.archive; found none in it")
+        raise InputError(folder, "a run with bodies.archive", "none in it")
     with reading(folder):
         found = from_arrays(own)
     return found, find_individuals(run.path, [int(number) for number in found.ids[filled(found)]])
@@ -319,9 +317,9 @@ def check_new_folder(folder: str | Path, option: str = "--out") -> None:
         return
     if folder.is_dir():
         hint = "; continue it with --resume" if (folder / "run.json").exists() else ""
-        raise InputError(f"{option} {folder}: expected a new or empty folder; found files{hint}")
+        raise InputError(f"{option} {folder}", "a new or empty folder", f"files{hint}")
     if folder.exists():
-        raise InputError(f"{option} {folder}: expected a new or empty folder; found a file")
+        raise InputError(f"{option} {folder}", "a new or empty folder", "a file")
 
 
 def create_run_folder(
@@ -393,14 +391,14 @@ def open_run_folder(folder: str | Path) -> RunFolder:
     folder = Path(folder).absolute()
     if not folder.is_dir():
         found = "a file" if folder.exists() else "none"
-        raise InputError(f"{folder}: expected a run folder; found {found}")
+        raise InputError(folder, "a run folder", found)
     if (folder / ".lock").exists() and is_new_folder(folder):
         found = "one that was not begun; begin it with --out"
-        raise InputError(f"{folder}: expected a run folder; found {found}")
+        raise InputError(folder, "a run folder", found)
     check_no_sweep(folder)
     for name in ("config.yaml", "run.json"):
         if not (folder / name).is_file():
-            raise InputError(f"{folder}: expected a run folder; found no {name} in it")
+            raise InputError(folder, "a run folder", f"no {name} in it")
     for path in folder.iterdir():
         _check_writable(path, folder)
     return _lock_run(folder)
@@ -417,7 +415,7 @@ def _check_writable(path: Path, folder: Path) -> None:
     else:
         what, fits = "a file or a folder", real.is_file() or real.is_dir()
     if not fits:
-        raise InputError(f"{path}: expected {what}; found something else")
+        raise InputError(path, what, "something else")
 
 
 def _lock_run(folder: Path) -> RunFolder:
@@ -431,7 +429,7 @@ def _lock_run(folder: Path) -> RunFolder:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         lock.close()
-        raise InputError(f"{folder}: expected a run that has stopped; found it running") from None
+        raise InputError(folder, "a run that has stopped", "it running") from None
     except OSError:  # a file system without locks
         pass
     if os.fstat(lock.fileno()).st_nlink == 0:  # removed meanwhile by another that gave up

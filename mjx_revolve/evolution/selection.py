@@ -247,7 +247,7 @@ def check_selection(settings: SelectionConfig, mu: int) -> None:
     size, children = f"evolution.population_size ({mu})", settings.offspring or mu
     elites = settings.elites if settings.type == "generational" else 0
     if elites >= mu:
-        raise InputError(f"bodies.selection.elites: expected less than {size}; found {elites}")
+        raise InputError("bodies.selection.elites", f"less than {size}", elites)
     if settings.type in ("comma", "generational") and children < mu - elites:
         least = f"at least {size}" + f" - elites ({elites})" * (elites > 0)
         raise InputError(

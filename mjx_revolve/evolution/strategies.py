@@ -219,9 +219,7 @@ def find_strategy(name: str) -> str:
         return known[_plain(name)]
     near = difflib.get_close_matches(_plain(name), known, n=1, cutoff=0.5)
     hint = f"; did you mean {known[near[0]]}?" if near else ""
-    raise InputError(
-        f"evolution.strategy: expected one of {', '.join(_strategies())}; found {name!r}{hint}"
-    )
+    raise InputError("evolution.strategy", f"one of {', '.join(_strategies())}", f"{name!r}{hint}")
 
 
 def _constructor_settings(
@@ -291,14 +289,11 @@ def _make_strategy(
     for key in ("learning_rate", "std_decay"):
         value = settings.get(key, 1.0)
         if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-            raise InputError(
-                f"evolution.strategy_params.{key}: expected a number > 0; found {value!r}"
-            )
+            raise InputError(f"evolution.strategy_params.{key}", "a number > 0", repr(value))
     keywords, used = _constructor_settings(name, settings, std_init, size, num_genes)
     if name == "LM_MA_ES" and size > 2 * num_genes:  # beyond, its first c_c > 2: a negative root
         raise InputError(
-            f"evolution.population_size: expected at most twice the {num_genes} genes for {name}; "
-            f"found {size}"
+            "evolution.population_size", f"at most twice the {num_genes} genes for {name}", size
         )
     try:
         algorithm = _strategies()[name](
@@ -306,9 +301,7 @@ def _make_strategy(
         )
     except AssertionError as error:  # how evosax refuses a population size
         rule = "an even number" if "even" in str(error) else f"a size that it can take ({error})"
-        raise InputError(
-            f"evolution.population_size: expected {rule} for {name}; found {size}"
-        ) from None
+        raise InputError("evolution.population_size", f"{rule} for {name}", size) from None
     params = algorithm.default_params
     fields = set(params.__dataclass_fields__)
     if "std_init" in fields:
@@ -319,14 +312,11 @@ def _make_strategy(
     free = sorted((fields - {"std_init", "params"}) | set(used))
     for key, value in changes.items():
         if key == "std_init":
-            raise InputError(
-                "evolution.strategy_params.std_init: expected evolution.std_init; found it here"
-            )
+            raise InputError("evolution.strategy_params.std_init", "evolution.std_init", "it here")
         if key not in free:
             names = ", ".join(free) or "none at all"
             raise InputError(
-                f"evolution.strategy_params.{key}: expected one of {names} for {name}; "
-                "found an unknown name"
+                f"evolution.strategy_params.{key}", f"one of {names} for {name}", "an unknown name"
             )
         params = params.replace(**{key: _as_param(key, value, getattr(params, key))})
     return Strategy(
@@ -353,4 +343,4 @@ def _as_param(key: str, value: object, default: jax.Array) -> jax.Array:
             array = np.array(np.nan)
         if array.shape == shape and np.isfinite(array).all():
             return jnp.asarray(array, jnp.asarray(default).dtype)
-    raise InputError(f"evolution.strategy_params.{key}: expected {kind}; found {value!r}")
+    raise InputError(f"evolution.strategy_params.{key}", kind, repr(value))

@@ -109,7 +109,7 @@ def next_step(plan: Plan) -> Step:
     label = short_path(folder)
     if not folder.is_dir() or not any(folder.iterdir()):
         if folder.exists() and not folder.is_dir():
-            raise InputError(f"{label}: expected a run folder; found a file")
+            raise InputError(label, "a run folder", "a file")
         return "begin"
     if not (folder / "config.yaml").exists() and is_new_folder(folder):
         return "begin"  # killed while its folder was made
@@ -122,8 +122,7 @@ def next_step(plan: Plan) -> Step:
         run.close()
     if found > length:
         raise InputError(
-            f"{label}: expected a run of {length} generations at most; found {found} "
-            "(choose another --out)"
+            label, f"a run of {length} generations at most", f"{found} (choose another --out)"
         )
     if finished and found == length:
         return "finished"
@@ -165,7 +164,7 @@ class Sweep:
         axes = read_axes(self.settings)
         for axis in axes:
             if axis.key == "evolution.seed":
-                raise InputError("--set evolution.seed: expected --seeds N instead; found it set")
+                raise InputError("--set evolution.seed", "--seeds N instead", "it set")
         return combine(axes, Path(self.config).stem)
 
     def plans(self, folder: Path) -> list[Plan]:
@@ -193,9 +192,7 @@ def check_folder(folder: Path) -> None:
     """Raises `InputError` for a folder that is not new, empty or a sweep's; see `next_step`."""
     check_output_folder(folder)
     if not (folder / SWEEP).is_file() and folder.is_dir() and any(folder.iterdir()):
-        raise InputError(
-            f"--out {folder}: expected a new or empty folder, or that of a sweep; found files"
-        )
+        raise InputError(f"--out {folder}", "a new or empty folder, or that of a sweep", "files")
 
 
 def write_sweep(folder: Path, sweep: Sweep) -> None:

@@ -169,7 +169,7 @@ def information_of(problem: FitProblem) -> np.ndarray:
     """`[R, P, P]` what each recording of a problem would contribute by itself, with usual noise."""
     model = linearize(problem, problem.origin())
     if not np.isfinite(model.track).all():
-        raise InputError("plan: expected motions that can be simulated; found some that diverge")
+        raise InputError("plan", "motions that can be simulated", "some that diverge")
     count, own = len(problem.parameters), len(problem.local)
     found = []
     for r in range(len(problem.recordings)):

@@ -116,7 +116,7 @@ def read_free(names: Sequence[str], robot: Robot) -> list[Parameter]:
     """
     if len(set(names)) < len(names):
         twice = next(name for name in names if list(names).count(name) > 1)
-        raise InputError(f"--free {twice}: expected each name once; found it twice")
+        raise InputError(f"--free {twice}", "each name once", "it twice")
     return [_read_one(name, robot) for name in names]
 
 
@@ -128,7 +128,7 @@ def _read_one(text: str, robot: Robot) -> Parameter:
     water = factor_names()
     if dot and axis in ("x", "y", "z") and base in water:
         if not water[base][0]:
-            raise InputError(f"--free {text}: expected {base} without an axis; found {axis!r}")
+            raise InputError(f"--free {text}", f"{base} without an axis", repr(axis))
         key, place = base, "xyz".index(axis)
     else:
         key, place = name, None
@@ -173,13 +173,12 @@ def _check_present(text: str, key: str, kinds: Mapping[str, ModuleType], robot: 
     }
     what, present = needs.get(key, ("", True))
     if not present:
-        raise InputError(f"--free {text}: expected a robot with {what}; found none")
+        raise InputError(f"--free {text}", f"a robot with {what}", "none")
     law = key.partition(".")[0]
     used = {*robot.fluid.drag}
     if "." in key and law not in used:
         raise InputError(
-            f"--free {text}: expected a law that acts on this robot ({', '.join(sorted(used))}); "
-            f"found {law}"
+            f"--free {text}", f"a law that acts on this robot ({', '.join(sorted(used))})", law
         )
 
 
@@ -199,9 +198,7 @@ def _plain_value(
             and not (field == "gain" and part.thruster.curve == "interpolated")
         }
         if not jets:
-            raise InputError(
-                f"--free {text}: expected a robot with a thruster's {field}; found none"
-            )
+            raise InputError(f"--free {text}", f"a robot with a thruster's {field}", "none")
         if field == "time_constant":
             own = {jet.time_constant for jet in jets.values()}
             start = max(own) or _USUAL_LAG
@@ -217,7 +214,7 @@ def _plain_value(
     if head not in ("ballast", "ballast_position"):
         return None
     if len(kinds) > 1:
-        raise InputError(f"--free {text}: expected @ and one module, as ballast@core; found more")
+        raise InputError(f"--free {text}", "@ and one module, as ballast@core", "more")
     [(module, kind)] = kinds.items()
     part = kind.parts[0]
     at = list(part.ballast_position)

@@ -351,7 +351,7 @@ def make_problem(
     parameters = read_free(own, robot)
     local = tuple(f"{n}_{x}" if x else n for n in common for x in RECORDING[n])
     if not parameters:
-        raise InputError("--free: expected at least one number of the robot; found none")
+        raise InputError("--free", "at least one number of the robot", "none")
     names = [m.name for m in robot.morphology.modules]
     hinges = [names[k] for k in robot.morphology.hinges]
     jets = [names[k] for k, _ in robot.morphology.thrusters]
@@ -453,8 +453,7 @@ def _prescribed(
             kinds = {n.partition(".")[0] for n in r.signals}
             if "angle" in kinds and "command" not in kinds:
                 raise InputError(
-                    f"{r.name}: expected the servos' commands (command.MODULE), as they are free; "
-                    "found none"
+                    r.name, "the servos' commands (command.MODULE), as they are free", "none"
                 )
         return set()
     found = [{h for h in hinges if f"angle.{h}" in r.signals} for r in recordings]

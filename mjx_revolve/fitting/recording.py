@@ -99,14 +99,10 @@ def read_map(options: Sequence[str], label: str = "--map") -> dict[str, str]:
             found[name.strip()] = source.strip()
             continue
         if not Path(option).is_file():
-            raise InputError(
-                f"{label} {option}: expected NAME=COLUMN, or a YAML file of them; found neither"
-            )
+            raise InputError(f"{label} {option}", "NAME=COLUMN, or a YAML file of them", "neither")
         data = load_yaml(option)
         if not isinstance(data, dict):
-            raise InputError(
-                f"{option}: expected a mapping of names to columns; found {show(data)}"
-            )
+            raise InputError(option, "a mapping of names to columns", show(data))
         found |= {str(key): str(value) for key, value in data.items()}
     return found
 
@@ -128,9 +124,7 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
     """
     path = check_path(path)
     if not path.exists():
-        raise InputError(
-            f"{path}: expected a CSV, an MCAP, a ROS 2 bag or a run folder; found none"
-        )
+        raise InputError(path, "a CSV, an MCAP, a ROS 2 bag or a run folder", "none")
     marks = {
         key.removeprefix("mark."): _read_mark(key, source, robot)
         for key, source in columns.items()
@@ -163,8 +157,7 @@ def _read_mark(key: str, source: str, robot: Robot) -> MarkedPoint:
     place = [x for x in read if x is not None]
     if module not in names or not len(read) == len(place) == 3:
         raise InputError(
-            f"--map {key}: expected a module ({', '.join(names)}), or MODULE:X,Y,Z [m]; found "
-            f"{show(source)}"
+            f"--map {key}", f"a module ({', '.join(names)}), or MODULE:X,Y,Z [m]", show(source)
         )
     return MarkedPoint(names.index(module), (place[0], place[1], place[2]))
 
@@ -189,14 +182,14 @@ def _read_csv(
     values = np.full((len(rows) - 1, len(header)), np.nan)
     for k, row in enumerate(rows[1:]):
         if len(row) != len(header):
-            raise InputError(f"row {k + 2}: expected {len(header)} cells; found {len(row)}")
+            raise InputError(f"row {k + 2}", f"{len(header)} cells", len(row))
         for j, cell in enumerate(row):
             if cell.strip():
                 try:
                     values[k, j] = float(cell)
                 except ValueError:
                     raise InputError(
-                        f"row {k + 2}, column {header[j]}: expected a number; found {show(cell)}"
+                        f"row {k + 2}, column {header[j]}", "a number", show(cell)
                     ) from None
     named = _name_columns(header, columns, robot)
     if "time" not in named:
@@ -210,7 +203,7 @@ def _read_csv(
     time = scale * values[:, column]
     if not np.isfinite(time).all():
         bad = int(np.flatnonzero(~np.isfinite(time))[0])
-        raise InputError(f"row {bad + 2}, column {header[column]}: expected a time; found none")
+        raise InputError(f"row {bad + 2}, column {header[column]}", "a time", "none")
     steps = np.diff(time)
     if np.any(steps <= 0):
         late = int(np.flatnonzero(steps <= 0)[0]) + 1
@@ -224,7 +217,7 @@ def _read_csv(
         value = scale * values[:, k] if k is not None else np.full(len(time), scale)
         known = np.isfinite(value)
         if not known.any():
-            raise InputError(f"column {header[k]}: expected numbers; found none, or NaN only")
+            raise InputError(f"column {header[k]}", "numbers", "none, or NaN only")
         found[name] = TimeSeries(time[known], value[known])
     return found, unused
 
@@ -250,11 +243,11 @@ def _name_columns(
             )
         found[name] = None, number
         if name == "time":
-            raise InputError(f"--map time: expected a column; found the number {source}")
+            raise InputError("--map time", "a column", f"the number {source}")
     modules = [m.name for m in robot.morphology.modules]
     twice = [column for column in header if header.count(column) > 1]
     if twice:
-        raise InputError(f"column {twice[0]}: expected each name once; found it twice")
+        raise InputError(f"column {twice[0]}", "each name once", "it twice")
     mapped = {k for k, _ in found.values()}
     for k, column in enumerate(header):
         head, _, rest = column.partition(".")
@@ -278,7 +271,7 @@ def _name_columns(
 def _factor(name: str, text: str) -> float:
     number = _finite(text)
     if number is None:
-        raise InputError(f"--map {name}: expected a number after *; found {show(text)}")
+        raise InputError(f"--map {name}", "a number after *", show(text))
     return number
 
 
@@ -439,7 +432,7 @@ def _name_marks(
         marks[name] = MarkedPoint(modules.index(name), (0.0, 0.0, 0.0))
     for name in marks:
         if name not in seen:
-            raise InputError(f"mark {name}: expected columns mark.{name}.x and .y; found none")
+            raise InputError(f"mark {name}", f"columns mark.{name}.x and .y", "none")
     return signals, marks
 
 
@@ -453,9 +446,9 @@ def _check_signals(
         raise InputError("expected x and y of the core, marks, or mean_speed; found none of them")
     if (speed := signals.get("mean_speed")) is not None:
         if len(speed.time) < 2:
-            raise InputError("mean_speed: expected rows from two times on; found one")
+            raise InputError("mean_speed", "rows from two times on", "one")
         if (low := float(np.mean(speed.value))) < 0:
-            raise InputError(f"mean_speed: expected at least 0 m/s; found {low:g}")
+            raise InputError("mean_speed", "at least 0 m/s", f"{low:g}")
     quat = [f"q{axis}" for axis in "wxyz"]
     for given, needed in ((("roll", "pitch"), ["qw" if "qw" in signals else "yaw"]), (quat, quat)):
         there = [n for n in given if n in signals]
@@ -466,7 +459,7 @@ def _check_signals(
             )
     for name, signal in signals.items():
         if not np.isfinite(signal.value).all():
-            raise InputError(f"{name}: expected finite numbers; found NaN or infinity")
+            raise InputError(name, "finite numbers", "NaN or infinity")
         head, _, module = name.partition(".")
         if head not in ("command", "angle"):
             continue
@@ -493,9 +486,7 @@ def _check_signals(
     if all(f"q{axis}" in signals for axis in "wxyz"):
         length = np.sqrt(sum(np.median(signals[f"q{a}"].value ** 2) for a in "wxyz"))
         if not 0.5 < length < 1.5:
-            raise InputError(
-                f"qw, qx, qy, qz: expected unit quaternions; found length {length:.3g}"
-            )
+            raise InputError("qw, qx, qy, qz", "unit quaternions", f"length {length:.3g}")
     for name in ("roll", "pitch", "yaw"):
         if name in signals and len(signals[name].time) > 2:
             time, angle = signals[name]

@@ -64,7 +64,7 @@ def read_settings(texts: Sequence[str]) -> tuple[FitSettings, dict[str, Any], bo
     own = {k: v for k, v in given.items() if not k.startswith("world.") and k != "trim"}
     trim = given.get("trim", "none")
     if trim not in ("neutral", "none"):
-        raise InputError(f"--set trim: expected neutral or none; found {show(trim)}")
+        raise InputError("--set trim", "neutral or none", show(trim))
     return read(FitSettings, own, "settings"), world, trim == "neutral"
 
 
@@ -97,15 +97,13 @@ def load_robot(
 
         config = load_config(source)
         if config.morphology is None:
-            raise InputError(f"{source}: expected one robot; found bodies that evolve")
+            raise InputError(source, "one robot", "bodies that evolve")
         body = load_morphology(config.morphology, _types(config.modules), config.allow_overlap)
         if config.coefficients is not None:
             entries = load_coefficients(config.coefficients)
             body = replace(body, modules=correct_modules(body.modules, entries, "coefficients"))
         if modules is not None:
-            raise InputError(
-                f"--modules: expected none, as {source} names its own; found {show(str(modules))}"
-            )
+            raise InputError("--modules", f"none, as {source} names its own", show(str(modules)))
         modules, trim = config.modules, trim or config.trim == "neutral"
         if world is None:
             world, overrides = config.world_name, config.world_overrides
@@ -187,7 +185,7 @@ class FitRun:
             path = folder.path / "config.yaml"
             data = load_yaml(path)
             if not isinstance(data, dict) or "free" not in data or "recordings" not in data:
-                raise InputError(f"{path}: expected that of a fit; found another run's")
+                raise InputError(path, "that of a fit", "another run's")
             modules = data.get("modules")
             types = _types(None if modules is None else str(folder.path / modules))
             body = load_morphology(folder.path / data["robot"], types, allow_overlap=True)

@@ -157,7 +157,7 @@ def make_brain(
         InputError: its step has an operation that files cannot hold.
     """
     if not robot.mj_model.nu:
-        raise InputError("controller: expected a robot with hinges or thrusters; found neither")
+        raise InputError("controller", "a robot with hinges or thrusters", "neither")
     plant = plant_of(robot) if rate is None else plant_of(robot).at_rate(rate)
     parameters = controller.decode(jnp.asarray(genes)[:, None], plant)
     initial = jax.tree.map(_wide, controller.init(parameters))

@@ -408,8 +408,7 @@ def kind_of(dtype: Any) -> str:
     ) else None  # fmt: skip
     if kind is None:
         raise InputError(
-            "controller: expected real numbers, signed whole numbers or truth values in its step; "
-            f"found {dtype}"
+            "controller", "real numbers, signed whole numbers or truth values in its step", dtype
         )
     return kind
 

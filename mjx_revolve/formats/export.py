@@ -77,14 +77,14 @@ def export_robot(
         done.append((folder, f"{len(shapes)} meshes (STL, m)"))
     if "mcap" in files:
         if trajectory is None:
-            raise InputError("mcap: expected a trajectory; found none")
+            raise InputError("mcap", "a trajectory", "none")
         write_bag(robot, trajectory, files["mcap"])
         rows, stamps = pick_rows(robot, trajectory)
         words = f"ROS 2 bag: {stamps[-1] / 1e9:.4g} s, {len(rows)} poses"
         done.append((files["mcap"], f"{words} of {len(make_links(robot))} links"))
     if "controller" in files:
         if brain is None:
-            raise InputError("controller: expected a brain; found none")
+            raise InputError("controller", "a brain", "none")
         done += _write_brain(brain, files["controller"])
     return done
 

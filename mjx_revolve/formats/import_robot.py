@@ -226,7 +226,7 @@ def _module(
             missing.append(f"{link.name}: an inertia that no body has; the nearest one is taken")
         parts += _with_mass(own, inertia, whole=not welded)
     elif link.parent >= 0:
-        raise InputError(f"{link.name}: expected a mass, as a hinge moves it; found none")
+        raise InputError(link.name, "a mass, as a hinge moves it", "none")
     kind["parts"] = parts
     return kind, welded
 
@@ -236,9 +236,7 @@ def _hinge(link: RigidLink, turn: np.ndarray, missing: list[str]) -> dict[str, A
     if "range" not in link.limits:
         missing.append(f"{link.name}: turns all the way; here from -π to π")
     if low > high:
-        raise InputError(
-            f"{link.name}: expected a range [lowest, highest]; found [{low:g}, {high:g}]"
-        )
+        raise InputError(link.name, "a range [lowest, highest]", f"[{low:g}, {high:g}]")
     if not low <= 0 <= high or low == high:
         missing.append(f"{link.name}: its range [{low:g}, {high:g}] lacks the rest pose, 0")
         low, high = min(low, 0.0), max(high, 0.0) + (low == high == 0) * 1e-3

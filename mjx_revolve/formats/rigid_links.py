@@ -126,7 +126,7 @@ def read_rigid_robot(path: str | Path) -> RigidRobot:
         read = _read_urdf if root.tag == "robot" else _read_mjcf
         robot = read(root, Path(path))
         if robot.links[0].inertia[3, 3] <= 0:
-            raise InputError(f"{robot.links[0].name}: expected a root with a mass; found none")
+            raise InputError(robot.links[0].name, "a root with a mass", "none")
         return robot
 
 
@@ -192,7 +192,7 @@ def _numbers(element: Element | None, name: str, count: int, default: str | None
         found = np.zeros(0)
     if found.shape != (count,) or not np.isfinite(found).all():
         tag = "none" if element is None else element.tag
-        raise InputError(f"<{tag}> {name}: expected {count} numbers; found {text or 'none'!r}")
+        raise InputError(f"<{tag}> {name}", f"{count} numbers", repr(text or "none"))
     return found
 
 
@@ -217,7 +217,7 @@ def _read_urdf(root: Element, path: Path) -> RigidRobot:
     links = {link.get("name", ""): link for link in root.findall("link")}
     for name, count in Counter(link.get("name", "") for link in root.findall("link")).items():
         if count > 1:
-            raise InputError(f"link {name}: expected each name once; found {count} of it")
+            raise InputError(f"link {name}", "each name once", f"{count} of it")
     below: dict[str, list[Element]] = {}
     children = set()
     for joint in root.findall("joint"):
@@ -226,10 +226,10 @@ def _read_urdf(root: Element, path: Path) -> RigidRobot:
         for name in names:
             if name not in links:
                 where = f"joint {joint.get('name')}"
-                raise InputError(f"{where}: expected a link of the file; found {name!r}")
+                raise InputError(where, "a link of the file", repr(name))
         below.setdefault(names[0], []).append(joint)
         if names[1] in children:
-            raise InputError(f"link {names[1]}: expected one parent; found two")
+            raise InputError(f"link {names[1]}", "one parent", "two")
         children.add(names[1])
     tops = [name for name in links if name not in children]
     if len(tops) != 1:
@@ -325,7 +325,7 @@ def _shape(
         if kind.tag != "sphere":
             size = np.append(size, _numbers(kind, "length", 1, None) / 2)
     if (size <= 0).any():
-        raise InputError(f"link {link}: expected sizes > 0; found {size.tolist()}")
+        raise InputError(f"link {link}", "sizes > 0", size.tolist())
     yield _box(kind.tag, size, place, rgb)
 
 

@@ -88,7 +88,7 @@ def pick_rows(robot: Robot, trajectory: Trajectory) -> tuple[np.ndarray, np.ndar
     finite &= np.isfinite(np.asarray(trajectory.qvel)).all(-1)
     count = len(finite) if finite.all() else int(finite.argmin())
     if count == 0:
-        raise InputError("rollout: expected finite poses; found none")
+        raise InputError("rollout", "finite poses", "none")
     every = min(max(1, round(1 / (RATE * timestep))), count)
     rows = np.arange(every - 1, count, every)
     # From the number of the step: the trajectory's own times are rounded to single precision.

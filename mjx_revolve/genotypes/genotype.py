@@ -151,20 +151,18 @@ def make_space(
         kind = catalogue.get(name)
         if kind is None or (kind.mount is None) != core:
             known = sorted(n for n, k in catalogue.items() if (k.mount is None) == core)
-            raise InputError(f"bodies.{place}: expected one of {', '.join(known)}; found {name!r}")
+            raise InputError(f"bodies.{place}", f"one of {', '.join(known)}", repr(name))
         return kind.name
 
     names = [find(f"modules.{i}", name, False) for i, name in enumerate(bodies.modules)]
     for i, name in enumerate(names):
         if name in names[:i]:
-            raise InputError(f"bodies.modules.{i}: expected each type once; found {name!r} again")
+            raise InputError(f"bodies.modules.{i}", "each type once", f"{name!r} again")
     max_of = {find("max_of", name, False): most for name, most in bodies.max_of.items()}
     for name in max_of:
         if name not in names:
             known = ", ".join(names)
-            raise InputError(
-                f"bodies.max_of: expected any of bodies.modules, {known}; found {name}"
-            )
+            raise InputError("bodies.max_of", f"any of bodies.modules, {known}", name)
     if bodies.min_hinges > 0 and all(catalogue[name].hinge is None for name in names):
         raise InputError(
             f"bodies.modules: expected a type with a hinge, since min_hinges is "

@@ -45,8 +45,7 @@ def find_genotype(
     if parse_user_function(name) is None:
         known = ", ".join(GENOTYPES)
         raise InputError(
-            f"{source}: bodies.genotype: expected one of {known}, or FILE.py:FUNCTION; "
-            f"found {name!r}"
+            f"{source}: bodies.genotype", f"one of {known}, or FILE.py:FUNCTION", repr(name)
         )
     function = load_user_function(name, f"{source}: bodies.genotype")
     expected = f"{short_name(name)} to make a genotype"
@@ -61,7 +60,7 @@ def _guard(name: str, genotype: object, space: Space) -> Genotype:
     """A user's genotype, with each error in its functions turned into one line."""
     place = function_place(name)
     if not isinstance(genotype, Genotype):
-        raise InputError(f"{place}: expected a Genotype; found {type(genotype).__name__}")
+        raise InputError(place, "a Genotype", type(genotype).__name__)
 
     def guarded(what: str) -> Callable[..., Any]:
         function, expected = getattr(genotype, what), f"{short_name(name)} to {what}"

@@ -423,15 +423,15 @@ def _read(plain: object, names: Sequence[str], space: Space) -> Grammar:
     known = {*names, *MOUNTING, *MOVING}
     for letter in (CORE, *names):
         if letter not in found.rules:
-            raise InputError(f"genome.rules: expected one for {letter}; found none")
+            raise InputError("genome.rules", f"one for {letter}", "none")
     for letter, rule in found.rules.items():
         place = f"genome.rules.{letter}"
         if letter not in (CORE, *names):
             raise InputError(f"{place}: expected a letter of {', '.join((CORE, *names))}")
         rest = rule[1:] if letter == CORE else rule
         if letter == CORE and rule[:1] != (CORE,):
-            raise InputError(f"{place}: expected {CORE} at its beginning; found {show(rule)}")
+            raise InputError(place, f"{CORE} at its beginning", show(rule))
         strange = {*rest} - known - (spelled if letter == CORE else set())
         if strange:
-            raise InputError(f"{place}: expected known letters; found {show(min(strange))}")
+            raise InputError(place, "known letters", show(min(strange)))
     return Grammar(found.name, {letter: found.rules[letter] for letter in (CORE, *names)}, seed)

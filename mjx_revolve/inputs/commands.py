@@ -136,7 +136,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
 def check_run_arguments(arguments: argparse.Namespace) -> None:
     """Raises `InputError` if both `--workers` and `--cluster` are given."""
     if arguments.cluster is not None and arguments.workers is not None:
-        raise InputError("--cluster: expected no --workers beside it; found both")
+        raise InputError("--cluster", "no --workers beside it", "both")
 
 
 def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
@@ -181,13 +181,13 @@ def check_colony_arguments(arguments: argparse.Namespace) -> None:
     """Raises `InputError` for options that do not go with `--colony`, or without it."""
     if not arguments.colony:
         if arguments.time is not None:
-            raise InputError("--time: expected --colony with it; found none")
+            raise InputError("--time", "--colony with it", "none")
         return
     for name in ("individual", "seed", "world", "modules"):
         if getattr(arguments, name) is not None:
-            raise InputError(f"--{name}: expected none with --colony; found one")
+            raise InputError(f"--{name}", "none with --colony", "one")
     if not Path(arguments.path).is_dir():
-        raise InputError(f"{arguments.path}: expected the run folder of a colony; found a file")
+        raise InputError(arguments.path, "the run folder of a colony", "a file")
 
 
 def opening_episode(arguments: argparse.Namespace) -> contextlib.AbstractContextManager[None]:
@@ -206,7 +206,7 @@ def check_no_sweep(path: str | Path) -> None:
     if (Path(path) / SWEEP).is_file():
         runs = sorted(Path(path).glob("*/seed_*/config.yaml"))
         such = f", such as {runs[0].parent}" if runs else ""
-        raise InputError(f"{path}: expected one run; found a sweep of several{such}")
+        raise InputError(path, "one run", f"a sweep of several{such}")
 
 
 def check_episode_path(path: str | Path) -> None:
@@ -233,19 +233,17 @@ def check_place(path: str | Path, label: str) -> None:
     for folder in Path(path).parents:
         if folder.is_dir():
             if not os.access(folder, os.W_OK | os.X_OK):
-                raise InputError(
-                    f"{label}: expected a folder to write into; found {folder} read-only"
-                )
+                raise InputError(label, "a folder to write into", f"{folder} read-only")
             return
         if folder.exists():
-            raise InputError(f"{label}: expected the folder {folder}; found a file")
+            raise InputError(label, f"the folder {folder}", "a file")
 
 
 def check_output_folder(folder: str | Path, option: str = "--out") -> None:
     """Raises `InputError` if no files can be written into a folder, before any work is done."""
     label = f"{option} {folder}".lstrip()
     if Path(folder).exists() and not Path(folder).is_dir():
-        raise InputError(f"{label}: expected a folder; found a file")
+        raise InputError(label, "a folder", "a file")
     check_place(Path(folder) / "any", label)
 
 

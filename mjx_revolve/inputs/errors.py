@@ -52,9 +52,17 @@ class InputError(ValueError):
     so are lists of names in a long message.
     """
 
-    def __init__(self, message: object = "") -> None:
-        """Takes the message."""
-        text = _LONG_VALUE.sub(_cut, plain(str(message)))
+    def __init__(self, place: object = "", expected: object = None, found: object = None) -> None:
+        """Takes the parts of a message, or all of it.
+
+        Args:
+            place: a file, an option, a key in it; or the whole message.
+            expected: in words; None where the message is whole.
+            found: in words, or a value as it is shown.
+        """
+        whole = expected is None
+        message = str(place) if whole else f"{place}: expected {expected}; found {found}"
+        text = _LONG_VALUE.sub(_cut, plain(message))
         super().__init__(_LONG_LIST.sub(_leave_out, text) if len(text) > _MAX_MESSAGE else text)
 
 
@@ -99,10 +107,10 @@ def reading(path: str | Path) -> Iterator[None]:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except FileNotFoundError:
-        raise InputError(f"{path}: expected a file; found none") from None
+        raise InputError(path, "a file", "none") from None
     except IsADirectoryError:
-        raise InputError(f"{path}: expected a file; found a folder") from None
+        raise InputError(path, "a file", "a folder") from None
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected UTF-8 text; found {error.reason}") from None
+        raise InputError(path, "UTF-8 text", error.reason) from None
     except OSError as error:
-        raise InputError(f"{path}: expected a readable file; found {error.strerror}") from None
+        raise InputError(path, "a readable file", error.strerror) from None

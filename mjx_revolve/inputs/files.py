@@ -29,9 +29,7 @@ def check_path(path: object) -> Path:
         str(path).encode()
         os.stat(path)
     except ValueError:
-        raise InputError(
-            f"{str(path)!r}: expected a path; found characters that none has"
-        ) from None
+        raise InputError(repr(str(path)), "a path", "characters that none has") from None
     except OSError as error:
         if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
             raise InputError(f"{path}: expected a path; found: {error.strerror}") from None
@@ -70,11 +68,10 @@ def check_name(path: str | Path, endings: Sequence[str], label: str | None = Non
     """
     path = Path(path)
     if path.is_dir():
-        raise InputError(f"{label or path}: expected a file; found a folder")
+        raise InputError(label or path, "a file", "a folder")
     if path.suffix.lower() not in endings:
         raise InputError(
-            f"{label or path}: expected a name that ends in {' or '.join(endings)}; found "
-            f"{path.suffix!r}"
+            label or path, f"a name that ends in {' or '.join(endings)}", repr(path.suffix)
         )
     return path
 
@@ -93,12 +90,12 @@ def resolve_inside(path: str | Path, folder: str | Path) -> Path:
         inside = Path(folder).resolve()
         full = (inside / path).resolve()
     except ValueError:
-        raise InputError(f"{str(path)!r}: expected a file name; found a null byte") from None
+        raise InputError(repr(str(path)), "a file name", "a null byte") from None
     except (OSError, RuntimeError):
-        raise InputError(f"{path}: expected a readable file; found a loop of links") from None
+        raise InputError(path, "a readable file", "a loop of links") from None
     if not full.is_relative_to(inside):
         found = "one" if ".." in Path(path).parts else "a link"
-        raise InputError(f"{path}: expected a path inside {folder}; found {found} that leads out")
+        raise InputError(path, f"a path inside {folder}", f"{found} that leads out")
     return full
 
 

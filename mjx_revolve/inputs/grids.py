@@ -61,7 +61,7 @@ def split_values(text: str, label: str) -> list[str]:
         # Neither a comma nor a comment nor another list may follow.
         values = values if not listed[node.value[-1].end_mark.index : -1].strip() else []
     if not values:
-        raise InputError(f"{label}: expected YAML values between commas; found {show(text)}")
+        raise InputError(label, "YAML values between commas", show(text))
     return [value.strip() for value in values]
 
 
@@ -79,8 +79,7 @@ def read_axes(settings: Sequence[str]) -> list[GridAxis]:
             read_overrides([setting])  # which raises the error
         if key in axes:
             raise InputError(
-                f"--set {key}: expected each setting once, with commas between its values; found "
-                "it twice"
+                f"--set {key}", "each setting once, with commas between its values", "it twice"
             )
         texts = split_values(text, f"--set {key}")
         values: list[Any] = []
@@ -88,7 +87,7 @@ def read_axes(settings: Sequence[str]) -> list[GridAxis]:
             (value,) = read_overrides([f"{key}={one}"])[0].values()
             # Python takes 1 for True.
             if any(value == x and isinstance(value, bool) == isinstance(x, bool) for x in values):
-                raise InputError(f"--set {key}: expected each value once; found {show(one)} twice")
+                raise InputError(f"--set {key}", "each value once", f"{show(one)} twice")
             values.append(value)
         axes[key] = GridAxis(key, tuple(texts))
     return list(axes.values())
@@ -110,7 +109,7 @@ def combine(axes: Sequence[GridAxis], otherwise: str) -> dict[str, tuple[str, ..
     """
     count = math.prod(len(axis.texts) for axis in axes)
     if count > _MAX_CASES:
-        raise InputError(f"--set: expected at most {_MAX_CASES} combinations; found {count}")
+        raise InputError("--set", f"at most {_MAX_CASES} combinations", count)
     several = [axis for axis in axes if len(axis.texts) > 1]
     leaves = [axis.key.rpartition(".")[2] for axis in several]
     words = [

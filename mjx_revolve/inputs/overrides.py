@@ -36,7 +36,7 @@ def read_overrides(overrides: Mapping[str, object] | Sequence[str]) -> tuple[dic
         key, equals, text = setting.partition("=")
         key = key.strip()
         if not equals or not key or not all(key.split(".")):
-            raise InputError(f"--set {setting}: expected KEY.PATH=VALUE; found {show(setting)}")
+            raise InputError(f"--set {setting}", "KEY.PATH=VALUE", show(setting))
         try:
             # The same reader as for files, so that 1e-3 is a number here too.
             parsed[key] = yaml.load(text, Loader=SafeLoader)
@@ -71,9 +71,7 @@ def merge_override(
             inner = {"name": inner}
         elif not isinstance(inner, dict):
             place = ".".join(sections[: depth + 1])
-            raise InputError(
-                f"{label} {key}: expected {place} to be a mapping; found {show(inner)}"
-            )
+            raise InputError(f"{label} {key}", f"{place} to be a mapping", show(inner))
         here[section] = inner
         here = inner
     if isinstance(value, Mapping) and isinstance(here.get(leaf), dict):

@@ -29,8 +29,7 @@ def check_package(place: str, module: str) -> None:
     """
     if importlib.util.find_spec(module) is None:
         raise InputError(
-            f"{place}: expected the package {module}; found none "
-            f"(pip install '{REQUIREMENTS[module]}')"
+            place, f"the package {module}", f"none (pip install '{REQUIREMENTS[module]}')"
         )
 
 

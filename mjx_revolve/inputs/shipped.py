@@ -59,6 +59,5 @@ def find_shipped(
         return here
     found = "none" if label is None else f"{str(path)!r}"
     raise InputError(
-        f"{label or path}: expected a file, or one of {', '.join(shipped)}, which come with the "
-        f"package; found {found}"
+        label or path, f"a file, or one of {', '.join(shipped)}, which come with the package", found
     )

@@ -93,7 +93,7 @@ def load_user_function(name: str, label: str, kind: type | tuple[type, ...] = ()
     """
     own = parse_user_function(name)
     if own is None:
-        raise InputError(f"{label}: expected FILE.py:FUNCTION; found {name!r}")
+        raise InputError(label, "FILE.py:FUNCTION", repr(name))
     module = _run_file(own.path, label)
     if not hasattr(module, own.function):
         made = [
@@ -107,9 +107,7 @@ def load_user_function(name: str, label: str, kind: type | tuple[type, ...] = ()
         )
     function = getattr(module, own.function)
     if not callable(function) and not isinstance(function, kind):
-        raise InputError(
-            f"{label}: expected a function {own.function} in {own.path}; found {function!r:.60}"
-        )
+        raise InputError(label, f"a function {own.function} in {own.path}", f"{function!r:.60}")
     return function
 
 
@@ -117,9 +115,9 @@ def _run_file(path: str, label: str) -> types.ModuleType:
     try:
         content = Path(path).read_bytes()
     except FileNotFoundError:
-        raise InputError(f"{label}: expected a file; found none at {path}") from None
+        raise InputError(label, "a file", f"none at {path}") from None
     except OSError as error:
-        raise InputError(f"{path}: expected a readable file; found {error.strerror}") from None
+        raise InputError(path, "a readable file", error.strerror) from None
     audit(path, "Python", content)
     digest = hashlib.sha256(path.encode() + b"\0" + content).hexdigest()[:16]
     name = f"mjx_revolve_own_{digest}"

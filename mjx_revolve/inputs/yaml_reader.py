@@ -91,9 +91,9 @@ def _construct_mapping(loader: SafeLoader, node: yaml.MappingNode) -> dict[Hasha
         key = loader.construct_object(key_node, deep=True)
         place = f"line {key_node.start_mark.line + 1}"
         if not isinstance(key, Hashable):
-            raise InputError(f"{place}: expected a plain key; found {show(key)}")
+            raise InputError(place, "a plain key", show(key))
         if key in mapping:
-            raise InputError(f"{place}: expected each key once; found {show(key)} twice")
+            raise InputError(place, "each key once", f"{show(key)} twice")
         mapping[key] = loader.construct_object(value_node, deep=True)
     return mapping
 
@@ -102,7 +102,7 @@ def _construct_int(loader: SafeLoader, node: yaml.ScalarNode) -> int:
     value = yaml.SafeLoader.construct_yaml_int(loader, node)
     if value.bit_length() > _MAX_BITS:  # hexadecimal digits may be as many as there are
         place = f"line {node.start_mark.line + 1}"
-        raise InputError(f"{place}: expected a whole number of a few digits; found a huge integer")
+        raise InputError(place, "a whole number of a few digits", "a huge integer")
     return value
 
 
@@ -141,7 +141,7 @@ def load_yaml(path: str | Path) -> Any:
     """
     content = read_file(path, _MAX_BYTES + 1)
     if len(content) > _MAX_BYTES:
-        raise InputError(f"{path}: expected at most {_MAX_BYTES // 10**6} MB of YAML; found more")
+        raise InputError(path, f"at most {_MAX_BYTES // 10**6} MB of YAML", "more")
     audit(path, "data", content)
     return parse_yaml(content, path)
 

@@ -41,7 +41,7 @@ def record_colony(
     assert colony is not None
     observed, _ = observe_colony(config, fitness, search, begin, duration, _GAP)
     if not observed:
-        raise InputError(f"{folder}: expected robots alive from {begin:g} s on; found none")
+        raise InputError(folder, f"robots alive from {begin:g} s on", "none")
     start = min(float(one.time[0]) for one in observed) - _GAP
     # A colony is advanced to the end of an interval.
     end = min(start + duration, max(float(one.time[-1]) for one in observed))

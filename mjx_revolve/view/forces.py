@@ -67,12 +67,12 @@ def module_forces(
     """
     model = robot.mj_model
     if isinstance(every, bool) or not isinstance(every, int) or every < 1:
-        raise InputError(f"every: expected a whole number of at least 1; found {every!r}")
+        raise InputError("every", "a whole number of at least 1", repr(every))
     count = np.shape(trajectory.time)[0]
     for name, width in (("qpos", model.nq), ("qvel", model.nv), ("ctrl", model.nu)):
         shape = np.shape(getattr(trajectory, name))
         if shape != (count, width):
-            raise InputError(f"trajectory.{name}: expected {[count, width]}; found {list(shape)}")
+            raise InputError(f"trajectory.{name}", f"{[count, width]}", list(shape))
     rows = np.arange(0, count, every)
     qpos, qvel = np.asarray(trajectory.qpos)[rows], np.asarray(trajectory.qvel)[rows]
     if trajectory.command is None:  # no lag is known: the commands themselves

@@ -135,10 +135,10 @@ def analyse_motion(
     """
     shape, expected = np.shape(trajectory.qpos), (np.size(trajectory.time), robot.mj_model.nq)
     if shape != expected:
-        raise InputError(f"trajectory.qpos: expected {[*expected]} [T, nq]; found {[*shape]}")
+        raise InputError("trajectory.qpos", f"{[*expected]} [T, nq]", [*shape])
     count = count_finite(trajectory.qpos)
     if count == 0:
-        raise InputError("trajectory.qpos: expected finite numbers in its first row; found none")
+        raise InputError("trajectory.qpos", "finite numbers in its first row", "none")
     columns = (trajectory.time, trajectory.qpos, trajectory.ctrl, trajectory.power)
     time, qpos, ctrl, power = (np.asarray(column, float)[:count] for column in columns)
     length = body_length(robot, task)

@@ -38,11 +38,11 @@ def draw_morphology(morphology: Morphology, path: str | Path) -> None:
     """
     path = check_name(path, (".png",))
     if not path.parent.is_dir():
-        raise InputError(f"{path}: expected the folder {path.parent} to exist; found none")
+        raise InputError(path, f"the folder {path.parent} to exist", "none")
     try:
         write_atomic(path, figure_png(_compose(morphology)))
     except OSError as error:
-        raise InputError(f"{path}: expected a writable file; found {error.strerror}") from None
+        raise InputError(path, "a writable file", error.strerror) from None
 
 
 @in_style

@@ -59,8 +59,7 @@ def finite_rows(episode: Episode) -> tuple[Episode, float | None]:
     count = count_finite(np.hstack([rows.qpos, rows.qvel]))
     if count == 0:
         raise InputError(
-            f"{episode.title}: trajectory.qpos: expected finite numbers in its first row; found "
-            "none"
+            f"{episode.title}: trajectory.qpos", "finite numbers in its first row", "none"
         )
     lost = None if count == len(rows.qpos) else float(rows.time[count])
     return _first_rows(replace(episode, trajectory=rows), count), lost

@@ -55,11 +55,9 @@ class ReplayRobot:
                 f"time; found {[*qpos.shape]} for times {[*time.shape]}"
             )
         if not (np.isfinite(time).all() and np.isfinite(qpos).all()):
-            raise InputError(
-                f"robot {self.name!r}: expected finite times and poses; found other numbers"
-            )
+            raise InputError(f"robot {self.name!r}", "finite times and poses", "other numbers")
         if (np.diff(time) <= 0).any():
-            raise InputError(f"robot {self.name!r}: time: expected rising times; found others")
+            raise InputError(f"robot {self.name!r}: time", "rising times", "others")
 
     def poses_at(self, time: np.ndarray, leap: float | None = None) -> np.ndarray:
         """Poses `[F, nq]` at times `[F]` [s].

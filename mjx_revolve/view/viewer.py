@@ -113,7 +113,7 @@ def write_colony_page(
     """
     path = check_name(path, PAGES)
     if not robots:
-        raise InputError("robots: expected at least one robot to show; found none")
+        raise InputError("robots", "at least one robot to show", "none")
     for one in robots:
         one.check()
     world = robots[0].robot.world

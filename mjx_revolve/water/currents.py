@@ -199,18 +199,17 @@ class CurrentField:
         for name in ("x", "y", "z", "velocity"):
             given = np.asarray(getattr(self, name))
             if given.dtype.kind not in "iuf":
-                raise InputError(f"{name}: expected real numbers; found {given.dtype}")
+                raise InputError(name, "real numbers", given.dtype)
             array = np.array(given, np.float64)
             if name != "velocity":
                 _check_axis(name, array)
                 shape.append(len(array))
             elif array.shape != (*shape, 3):
                 raise InputError(
-                    f"velocity: expected shape {[*shape, 3]}, as x, y and z have it; found "
-                    f"{list(array.shape)}"
+                    "velocity", f"shape {[*shape, 3]}, as x, y and z have it", list(array.shape)
                 )
             if not np.all(np.isfinite(array)):
-                raise InputError(f"{name}: expected finite numbers; found NaN or infinity")
+                raise InputError(name, "finite numbers", "NaN or infinity")
             array += 0.0  # -0.0 and 0.0 are one number
             array.setflags(write=False)
             object.__setattr__(self, name, array)
@@ -238,11 +237,11 @@ class CurrentField:
 
 def _check_axis(name: str, axis: np.ndarray) -> None:
     if axis.ndim != 1 or not len(axis):
-        raise InputError(f"{name}: expected a row of numbers [m]; found shape {list(axis.shape)}")
+        raise InputError(name, "a row of numbers [m]", f"shape {list(axis.shape)}")
     falls = np.flatnonzero(np.diff(axis) <= 0)
     if len(falls):
         first, second = axis[falls[0] : falls[0] + 2]
-        raise InputError(f"{name}: expected rising numbers [m]; found {second:g} after {first:g}")
+        raise InputError(name, "rising numbers [m]", f"{second:g} after {first:g}")
 
 
 _COLUMNS = ("x", "y", "z", "u", "v", "w")
@@ -291,7 +290,7 @@ def load_current_field(path: str | Path) -> CurrentField:
     read = {".npz": _read_arrays, ".csv": _read_table}.get(path.suffix.lower())
     if read is None:
         found = path.suffix or "no suffix"
-        raise InputError(f"{path}: expected a file .npz or .csv; found {found}")
+        raise InputError(path, "a file .npz or .csv", found)
     audit(path, "data", read_file(path))
     with reading(path):
         return read(path)
@@ -321,14 +320,14 @@ def _read_table(path: Path) -> CurrentField:
     for name in _COLUMNS:
         if heading.count(name) != 1:
             found = f"{name} twice" if name in heading else f"no {name}"
-            raise InputError(f"line 1: expected columns {', '.join(_COLUMNS)}; found {found}")
+            raise InputError("line 1", f"columns {', '.join(_COLUMNS)}", found)
     rows = []
     for number, line in enumerate(lines[1:], 2):
         if line.strip():
             with reading(f"line {number}"):
                 rows.append(_read_row(line.split(","), len(heading)))
     if not rows:
-        raise InputError("line 2: expected rows of numbers; found none")
+        raise InputError("line 2", "rows of numbers", "none")
     table = np.array(rows)
     columns = {name: table[:, heading.index(name)] for name in _COLUMNS}
     axes = [np.unique(columns[name]) for name in "xyz"]

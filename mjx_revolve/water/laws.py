@@ -390,5 +390,5 @@ def find_law(laws: Mapping[str, L], name: str) -> L:
         InputError: there is none of this name.
     """
     if name not in laws:
-        raise InputError(f"law: expected one of {', '.join(laws)}; found {name!r}")
+        raise InputError("law", f"one of {', '.join(laws)}", repr(name))
     return laws[name]

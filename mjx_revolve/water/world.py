@@ -257,14 +257,12 @@ def load_world(name: str | Path, **overrides: Any) -> World:
 def _find_world(name: str | Path) -> Path:
     """The file of a world."""
     if not isinstance(name, str | Path):
-        raise InputError(f"world: expected a name or a path; found {show(name)}")
+        raise InputError("world", "a name or a path", show(name))
     check_path(name)
     shipped = list_shipped("worlds")
     path = shipped.get(str(name), Path(name))
     if not path.exists() and path.suffix not in (".yaml", ".yml"):
-        raise InputError(
-            f"world: expected one of {', '.join(shipped)} or a YAML file; found {str(name)!r}"
-        )
+        raise InputError("world", f"one of {', '.join(shipped)} or a YAML file", repr(str(name)))
     return path
 
 

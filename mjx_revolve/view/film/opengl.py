@@ -43,10 +43,10 @@ def find_opengl() -> str:
     wish = os.environ.get("MUJOCO_GL", "").strip().lower()
     wish = {"glx": "glfw", "wgl": "glfw"}.get(wish, wish)
     if wish in ("disable", "disabled", "off", "false", "0"):
-        raise InputError(f"MUJOCO_GL={wish}: expected OpenGL to draw with; found it switched off")
+        raise InputError(f"MUJOCO_GL={wish}", "OpenGL to draw with", "it switched off")
     if wish and wish not in ("enable", "enabled", "on", "true", "1"):
         if wish not in ways:
-            raise InputError(f"MUJOCO_GL: expected one of {', '.join(ways)}; found {wish!r}")
+            raise InputError("MUJOCO_GL", f"one of {', '.join(ways)}", repr(wish))
         ways = (wish,)
     if system == "linux" and not _has_display() and not wish:
         ways = tuple(way for way in ways if way != "glfw")

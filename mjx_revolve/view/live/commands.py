@@ -106,8 +106,8 @@ def read_command(data: object) -> Command:
     name = data.get("do")
     if not isinstance(name, str) or name not in _COMMANDS:
         found = show(name) if "do" in data else "nothing"
-        raise InputError(f"do: expected one of {', '.join(_COMMANDS)}; found {found}")
+        raise InputError("do", f"one of {', '.join(_COMMANDS)}", found)
     given = {key: value for key, value in data.items() if key != "do"}
     if given and not fields(_COMMANDS[name]):
-        raise InputError(f"{name}: expected nothing beside `do`; found {show(given)}")
+        raise InputError(name, "nothing beside `do`", show(given))
     return read(_COMMANDS[name], given, name)

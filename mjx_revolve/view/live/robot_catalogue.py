@@ -182,8 +182,7 @@ def _kind(path: str) -> str:
     if isinstance(data, dict) and "task" in data:
         return "config"
     raise InputError(
-        f"{path}: expected a run folder, a configuration or a morphology; found a file with "
-        "neither task nor body"
+        path, "a run folder, a configuration or a morphology", "a file with neither task nor body"
     )
 
 
@@ -240,7 +239,7 @@ def _run_drafts(own: Config, water: World, folder: Path) -> list[_Draft]:
             name = f"{short}: {life.score:.3g} {selected}"
             drafts.append(_Draft(name, short, group, body, _known(life.genes, short)))
     if not drafts:
-        raise InputError(f"{folder}: expected a champion or individuals; found none yet")
+        raise InputError(folder, "a champion or individuals", "none yet")
     return drafts
 
 
@@ -253,7 +252,7 @@ def _known(genes: np.ndarray | None, place: str) -> _Genes:
 
     def find(count: int) -> np.ndarray | None:
         if genes is not None and len(genes) != count:
-            raise InputError(f"{place}: genes: expected {count}; found {len(genes)}")
+            raise InputError(f"{place}: genes", count, len(genes))
         return genes
 
     return find

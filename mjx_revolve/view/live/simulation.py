@@ -280,7 +280,7 @@ class LiveSimulation:
             case Remove():
                 found = [one for one in self.robots if one.key == command.key]
                 if not found:
-                    raise InputError(f"remove.key: expected a robot's; found {command.key}")
+                    raise InputError("remove.key", "a robot's", command.key)
                 self._remove(found[0])
             case Current():
                 self._set_current(command.velocity)
@@ -304,9 +304,7 @@ class LiveSimulation:
 
     def _drop(self, command: Drop) -> int:
         if command.entry >= len(self.catalogue):
-            raise InputError(
-                f"drop.entry: expected a number below {len(self.catalogue)}; found {command.entry}"
-            )
+            raise InputError("drop.entry", f"a number below {len(self.catalogue)}", command.entry)
         entry = self.catalogue[command.entry]
         robot = entry.robot
         body = self.meshes.add(robot)
@@ -351,7 +349,7 @@ class LiveSimulation:
             x, y = place[0] + r * math.cos(angle), place[1] + r * math.sin(angle)
             if all(math.hypot(x - at[0], y - at[1]) >= far for at, far in taken):
                 return x, y
-        raise InputError(f"drop.place: expected a place with room around it; found {[*place]}")
+        raise InputError("drop.place", "a place with room around it", [*place])
 
     # ------------------------------------------------------------------ events
 

@@ -227,16 +227,16 @@ def choose_individuals(record: RunRecord, which: str | Sequence[int]) -> list[in
     """
     population = record.population
     if population is None:
-        raise InputError(f"{record.label}: expected a run in which bodies evolve; found another")
+        raise InputError(record.label, "a run in which bodies evolve", "another")
     if not isinstance(which, str):
         for number in which:
             if number not in population.lives:
-                raise InputError(f"{record.label}: expected individual {number}; found none")
+                raise InputError(record.label, f"individual {number}", "none")
         return list(dict.fromkeys(which))
     if which == "archive":
         archive = fill_archive(record)
         if archive is None:
-            raise InputError(f"{record.label}: expected a run with an archive; found none")
+            raise InputError(record.label, "a run with an archive", "none")
         return archive.ids[archives.filled(archive)].tolist()
     found = [*population.alive(population.last)[:_LAST], *(s.life for s in _family(record))]
     return list(dict.fromkeys(life.number for life in found if not math.isnan(life.score)))

@@ -53,7 +53,7 @@ def replay_champion(record: RunRecord, fitness: Fitness) -> ChampionReplay:
         InputError: there is no champion, or it is another controller's.
     """
     if record.genes is None or record.config is None:
-        raise InputError(f"{record.label}: expected a champion and a configuration; found none")
+        raise InputError(record.label, "a champion and a configuration", "none")
     if len(record.genes) != fitness.num_genes:
         raise InputError(
             f"champion/genes.yaml: genes: expected {fitness.num_genes}, as config.yaml has it; "

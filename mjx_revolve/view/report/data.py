@@ -50,7 +50,7 @@ def read_run(folder: str | Path) -> RunRecord:
     path = check_path(folder)
     if not path.is_dir():
         found = "a file" if path.exists() else "none"
-        raise InputError(f"{path}: expected a run folder; found {found}")
+        raise InputError(path, "a run folder", found)
     with suppress(InputError):  # without a config.yaml, the rest is read
         path = find_run(path)
     label = str(path) if str(path) not in (".", "..") else path.resolve().name
@@ -68,7 +68,7 @@ def read_run(folder: str | Path) -> RunRecord:
     anything = (record.info, record.settings, record.metrics, record.genes is not None)
     if not any(anything):
         found = "; ".join(problem.text for problem in record.problems if problem.kind == "damaged")
-        raise InputError(f"{folder}: expected a run folder; found {found or 'nothing of a run'}")
+        raise InputError(folder, "a run folder", found or "nothing of a run")
     return record
 
 
@@ -97,7 +97,7 @@ def read_runs(names: Sequence[str]) -> tuple[list[RunRecord], list[str]]:
             continue
         place = record.folder.resolve()
         if place in seen:
-            raise InputError(f"{name}: expected each run once; found it as {seen[place]}, too")
+            raise InputError(name, "each run once", f"it as {seen[place]}, too")
         seen[place] = name
         records.append(record)
     if not records:
@@ -125,7 +125,7 @@ def _read_config(record: RunRecord) -> None:
     with record.noting_damage():
         data = load_yaml(path)
         if not isinstance(data, dict) or not data:
-            raise InputError("config.yaml: expected a mapping of settings; found something else")
+            raise InputError("config.yaml", "a mapping of settings", "something else")
         record.settings = data
     if not record.settings:
         return
@@ -200,7 +200,7 @@ def _read_champion(record: RunRecord) -> None:
         with record.noting_damage():
             found = run.load_champion()
             if not found.genes.size:
-                raise InputError(f"{found.path}: genes: expected finite numbers; found none")
+                raise InputError(f"{found.path}: genes", "finite numbers", "none")
             record.genes, record.champion = found.genes, dict(found.facts)
     if (path := record.folder / PASSPORT).is_file():
         with record.noting_damage():

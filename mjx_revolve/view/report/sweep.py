@@ -80,7 +80,7 @@ def write_report(folder: str | Path, page: Path | None = None) -> SweepReport:
     outcomes, lost = find_outcomes(plans)
     if not outcomes:
         found = lost[0] if lost else "none"
-        raise InputError(f"{short_path(folder)}: expected runs that are finished; found {found}")
+        raise InputError(short_path(folder), "runs that are finished", found)
     text = make_report(sweep, folder, outcomes, lost, page.parent)
     write_csv(folder / TABLE, list_rows(sweep, outcomes))
     write_atomic(page, text.encode())
