@@ -68,7 +68,9 @@ def plot_archive(
         The figure. Empty cells are blank.
     """
     cells = filled(archive)
-    marked = best(archive) if champion is None else _find(archive, champion)
+    marked = best(archive)
+    if champion is not None:
+        marked = next(iter(np.flatnonzero(archive.ids == champion).tolist()), -1)
     colors = ScalarMappable(cmap="viridis")
     if cells.size:
         colors.set_norm(Normalize(archive.scores[cells].min(), archive.scores[cells].max()))
@@ -87,12 +89,6 @@ def plot_archive(
         count += f" · {name}: {archive.scores[marked]:.3g}"
     axes.set_title(count)
     return figure
-
-
-def _find(archive: Archive, individual: int) -> int:
-    """The cell of an individual; -1: it is not there."""
-    found = np.flatnonzero(archive.ids == individual)
-    return int(found[0]) if found.size else -1
 
 
 # --- two axes -------------------------------------------------------------------------------------

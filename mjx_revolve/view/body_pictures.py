@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -58,23 +58,17 @@ def draw_bodies(bodies: Sequence[Morphology]) -> list[np.ndarray]:
         `[height, width, 3]` uint8 each, on white, row 0 the highest.
     """
     scenes = [rest_scene(body) for body in bodies]
-    flat = [scene.corners.reshape(-1, 3) @ REST_VIEW[:2].T for scene in scenes]
+    bounds = [scene.bounds(REST_VIEW) for scene in scenes]
     room = np.array(SIZE) - 2 * _MARGIN
-    pixel = max((float((np.ptp(points, axis=0) / room).max()) for points in flat), default=1.0)
+    pixel = max((float(((high - low) / room).max()) for low, high in bounds), default=1.0)
     pictures = []
-    for scene, points in zip(scenes, flat, strict=True):
-        low, high = points.min(axis=0) - pixel, points.max(axis=0) + pixel
-        image = draw_scene(scene, REST_VIEW, low, high, pixel)[0][::-1]
+    for scene, (low, high) in zip(scenes, bounds, strict=True):
+        image = draw_scene(scene, REST_VIEW, low - pixel, high + pixel, pixel)[0][::-1]
         page = np.ones((SIZE[1], SIZE[0], 3))
         top, left = (np.array(page.shape[:2]) - image.shape[:2]) // 2
         page[top : top + image.shape[0], left : left + image.shape[1]] = on_white(image)
         pictures.append(np.round(255 * page).astype(np.uint8))
     return pictures
-
-
-def _show(axes: Axes, picture: np.ndarray) -> None:
-    axes.set_axis_off()
-    axes.imshow(picture, interpolation="lanczos")
 
 
 @in_style
@@ -101,7 +95,7 @@ def plot_best(folder: Path, modules: Mapping[str, ModuleType], title: str = "") 
     for axes in grid.flat:
         axes.set_axis_off()
     for axes, picture, life in zip(grid.flat, pictures, best, strict=False):
-        _show(axes, picture)
+        axes.imshow(picture, interpolation="lanczos")
         look: dict[str, Any] = {"ha": "center", "va": "top", "transform": axes.transAxes}
         score = f"{life.score:.3g}".replace("-", "\u2212")
         axes.text(0.5, -0.01, f"{life.number}: {score}", fontsize=9.5, color=INK, **look)
@@ -147,7 +141,7 @@ def plot_bodies(
         axes.set_axis_off()
     for line, (k, name, some) in zip(grid, lines, strict=True):
         for axes, (outcome, body) in zip(line, some, strict=False):
-            _show(axes, next(pictures))
+            axes.imshow(next(pictures), interpolation="lanczos")
             length = 100 * body.descriptors["length"]
             words = f"seed {outcome.plan.seed}: {outcome.champion['score']:.3g}, {length:.0f} cm"
             axes.set_title(words.replace("-", "−"), loc="center", fontsize=7, pad=2)
@@ -176,22 +170,19 @@ def plot_descriptors(
         named).
     """
     generations = [g for g in population.living if population.alive(g)]
-    widest = max((len(population.alive(g)) for g in generations), default=0)
     shown: dict[str, np.ndarray] = {}  # [individuals, generations]
     for name in dict.fromkeys((*named, *_FIRST)):
-        table = np.full((widest, len(generations)), np.nan)
-        for k, generation in enumerate(generations):
-            values = population.figures(generation, name)
-            table[: len(values), k] = values
+        columns = [population.figures(generation, name) for generation in generations]
+        table = np.array([*zip_longest(*columns, fillvalue=np.nan)])
         known = table[np.isfinite(table)]
         if known.size and (name in named or np.ptp(known) > 0) and len(shown) < _PANELS:
             shown[name] = table
     if not shown:
         return None
-    columns = min(4, len(shown))
-    figure = new_figure(WIDE, 0.5 + 1.95 * -(-len(shown) // columns))
+    wide = min(4, len(shown))
+    figure = new_figure(WIDE, 0.5 + 1.95 * -(-len(shown) // wide))
     dot = "o" if len(generations) < 3 else None
-    grid = panels(figure, len(shown), columns, over, sharex=True)
+    grid = panels(figure, len(shown), wide, over, sharex=True)
     for axes, (name, table) in zip(grid, shown.items(), strict=True):
         low, high = quantiles(table, (0.25, 0.75))
         some = np.isfinite(low)

@@ -24,7 +24,7 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.formats.links import make_links, make_meshes
 from mjx_revolve.inputs.templates import data_address, make_templates
 from mjx_revolve.view.palette import ACCENT
-from mjx_revolve.view.pieces import Scene, make_pieces, place_pieces
+from mjx_revolve.view.pieces import Scene, make_pieces, rest_scene
 from mjx_revolve.view.raster import draw_scene, make_view, on_white
 
 # Width and height of a picture [pixels], and what stays free at its edges.
@@ -237,9 +237,7 @@ def _thruster_rows(robot: Robot) -> list[dict[str, object]]:
 
 def _steps(body: Morphology) -> list[dict[str, str]]:
     """The assembly, module by module, each after its parent."""
-    pieces, steps = make_pieces(body), []
-    frames = [(np.asarray(m.position), np.asarray(m.rotation)) for m in body.modules]
-    whole = place_pieces(pieces, lambda piece: frames[piece.module])
+    pieces, whole, steps = make_pieces(body), rest_scene(body), []
     owner = np.array([piece.module for piece in pieces])[whole.part]
     marks = np.array([piece.mark for piece in pieces])[whole.part]
     for k, module in enumerate(body.modules):
@@ -297,8 +295,7 @@ def _numbers(values: Sequence[float] | np.ndarray, digits: int) -> str:
 
 def _draw(scene: Scene, whole: Scene, view: np.ndarray) -> str:
     """A picture as the source of an image: what is there of a robot, in the whole's frame."""
-    points = whole.corners.reshape(-1, 3) @ view[:2].T
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = whole.bounds(view)
     pixel = float(((high - low) / (_SIZE - 2 * _MARGIN)).max())
     low = (low + high - pixel * (_SIZE - 2)) / 2
     image = draw_scene(scene, view, low, low + pixel * (_SIZE - 2), pixel)[0][::-1]

@@ -12,7 +12,7 @@ from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from mjx_revolve.episodes.colony_config import ColonyConfig
-from mjx_revolve.view.colony_history import ColonyHistory, Lifespan
+from mjx_revolve.view.colony_history import ColonyHistory
 from mjx_revolve.view.convergence import scale_time
 from mjx_revolve.view.plots import (
     BLUE,
@@ -137,13 +137,6 @@ def _limit_time(axes: Axes, history: ColonyHistory, scale: float) -> None:
     axes.set_xlim(-0.012 * end, 1.012 * end)
 
 
-def _lifelines(spans: Sequence[Lifespan], scale: float, room: float) -> LineCollection:
-    """A line for each life, the k-th at height k; as thick as `room` [points] allows."""
-    lines = [[(span.born / scale, k), (span.end / scale, k)] for k, span in enumerate(spans)]
-    width = float(np.clip(room / max(len(spans), 1), _THIN, _THICK))
-    return LineCollection(lines, linewidths=width, capstyle="butt")
-
-
 # --- families -------------------------------------------------------------------------------------
 
 
@@ -178,12 +171,10 @@ def plot_families(history: ColonyHistory, champion: int | None = None, title: st
     top.set_ylim(bottom=0)
     legend_above(top, 0.0)
     row = {span.number: k for k, span in enumerate(spans)}
-    lines = _lifelines(spans, scale, 330.0)
-    lines.set_color(hues)
-    _draw_descent(
-        low, history, row, hues, scale, max(0.45, 0.3 * float(np.ravel(lines.get_linewidth())[0]))
-    )
-    low.add_collection(lines)
+    width = float(np.clip(330.0 / max(len(spans), 1), _THIN, _THICK))
+    _draw_descent(low, history, row, hues, scale, max(0.45, 0.3 * width))
+    lines = [[(span.born / scale, k), (span.end / scale, k)] for k, span in enumerate(spans)]
+    low.add_collection(LineCollection(lines, linewidths=width, capstyle="butt", colors=hues))
     if champion in row:
         _draw_line(low, history, champion, row, scale)
     low.set(xlabel=words, ylabel=f"{len(spans)} robots by family", ylim=(len(spans) + 1.0, -2.0))

@@ -66,9 +66,9 @@ def _compose(morphology: Morphology) -> Figure:
     room = np.array([8.3, height - 0.75])
     axes = figure.add_axes((0.1 / width, 0.1 / height, room[0] / width, room[1] / height))
     axes.set_axis_off()
-    corners = scene.corners.reshape(-1, 3) @ REST_VIEW[:2].T
-    unit = float((np.ptp(corners, axis=0) / room).max()) * 1.1  # metres per inch
-    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    lowest, highest = scene.bounds(REST_VIEW)
+    unit = float(((highest - lowest) / room).max()) * 1.1  # metres per inch
+    middle = (lowest + highest) / 2
     (left, bottom), (right, top) = middle - unit * room / 2, middle + unit * room / 2
     axes.axis((left, right, bottom, top))
     show_scene(axes, scene, REST_VIEW, unit / _DPI)

@@ -44,6 +44,11 @@ class Scene:
     color: np.ndarray
     part: np.ndarray
 
+    def bounds(self, view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Lower left and upper right corner `[2]` of the picture in a `raster.make_view` [m]."""
+        points = self.corners.reshape(-1, 3) @ view[:2].T
+        return points.min(axis=0), points.max(axis=0)
+
 
 @dataclass(frozen=True)
 class Piece:

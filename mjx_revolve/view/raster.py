@@ -154,7 +154,7 @@ def draw_scene(
 
 
 def show_scene(
-    axes: Axes, scene: Scene, view: np.ndarray, pixel: float, alpha: float = 1.0, zorder: float = 3
+    axes: Axes, scene: Scene, view: np.ndarray, pixel: float, alpha: float = 1.0
 ) -> None:
     """Puts a picture of a scene into axes in metres of the view, limits unchanged.
 
@@ -164,12 +164,10 @@ def show_scene(
         view: from `make_view`.
         pixel: size of a pixel [m].
         alpha: opacity, 0 to 1.
-        zorder: of the picture among the artists of the axes.
     """
-    points = scene.corners.reshape(-1, 3) @ view[:2].T
-    low, high = points.min(axis=0) - 4 * pixel, points.max(axis=0) + 4 * pixel
-    image, extent = draw_scene(scene, view, low, high, pixel)
+    low, high = scene.bounds(view)
+    image, extent = draw_scene(scene, view, low - 4 * pixel, high + 4 * pixel, pixel)
     limits = axes.axis()
     axes.imshow(image, extent=extent, origin="lower", interpolation="bilinear", aspect="auto",
-                alpha=alpha, zorder=zorder)  # fmt: skip
+                alpha=alpha, zorder=3)  # fmt: skip
     axes.axis(limits)

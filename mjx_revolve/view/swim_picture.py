@@ -278,8 +278,8 @@ def _label_poses(
     """The time of each pose above it, where the last label is at least `least` [m] away."""
     last = None
     for row, scene in zip(motion.poses, scenes, strict=True):
-        points = scene.corners.reshape(-1, 3) @ view[:2].T
-        at = np.array([(points[:, 0].min() + points[:, 0].max()) / 2, points[:, 1].max()])
+        low, high = scene.bounds(view)
+        at = np.array([(low[0] + high[0]) / 2, high[1]])
         if last is None or np.abs(at - last).max() > least:
             when = f"{motion.time[row]:.1f}".removesuffix(".0") + " s"
             _write(axes, when, at, xytext=(0, 9), textcoords="offset points", fontsize=12,
