@@ -57,7 +57,10 @@ def draw_shaded(film: Film, way: str) -> Iterator[tuple[Any, np.ndarray, int]]:
     Yields:
         `[height, width, 3]` uint8, depths along the view `[height, width]` [m], the frame's number.
     """
-    model, shots, origin = _stage_of(film), film.shots, film.origin
+    shots, origin = film.shots, film.origin
+    reach = float(np.linalg.norm((film.center - origin)[:, :2], axis=1).max()) + shots.distance
+    robots = {k: one.robot for k, one in enumerate(film.robots)}
+    model = build_stage(robots, film.world, film.size, origin, reach, _SIGHT * shots.distance)
     shade = make_shader(
         film.world, film.size, shots.distance / film.fine, shots.above, origin.tolist()
     )
@@ -68,7 +71,7 @@ def draw_shaded(film: Film, way: str) -> Iterator[tuple[Any, np.ndarray, int]]:
             scene.flags[flag] = 0
         groups = model.geom_group.copy()
         for frame in range(len(film.time)):
-            _arrange(model, data, scene, film, groups, frame)
+            _arrange(data, scene, film, groups, frame)
             color, depth = paint(scene)
             water = jax.tree.map(lambda x, frame=frame: np.float32(x[frame]), film.water)
             # JAX works on this frame while MuJoCo draws the next.
@@ -86,53 +89,29 @@ def draw_shaded(film: Film, way: str) -> Iterator[tuple[Any, np.ndarray, int]]:
             yield waiting
 
 
-def _stage_of(film: Film) -> mujoco.MjModel:
-    """What is drawn of a film's robots and the world around them."""
-    distance, off = film.shots.distance, film.center - film.origin
-    reach = float(np.linalg.norm(off[:, :2], axis=1).max()) + distance
-    robots = {k: one.robot for k, one in enumerate(film.robots)}
-    return build_stage(robots, film.world, film.size, film.origin, reach, _SIGHT * distance)
-
-
-def _aim(camera: mujoco.MjvCamera, film: Film, frame: int) -> None:
-    """Puts MuJoCo's camera where the film's stands."""
-    shots = film.shots
+def _arrange(
+    data: mujoco.MjData, scene: mujoco.MjvScene, film: Film, groups: np.ndarray, frame: int
+) -> None:
+    """Puts robots, camera and light in their places; hides robots that are not alive."""
+    model, shots = data.model, film.shots
+    owner = model.body_rootid[model.geom_bodyid]
+    for k, one in enumerate(film.robots):
+        own = owner == model.jnt_bodyid[model.joint(f"{k}/root").id]
+        model.geom_group[own] = groups[own] if one.alive[frame] else _HIDDEN
+        qpos = robot_qpos(data, k)
+        qpos[:] = one.qpos[frame]
+        qpos[:3] -= film.origin
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_camlight(model, data)
+    camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
     x, y, z = shots.axes(frame)[2]
     camera.lookat[:] = shots.target[frame] - film.origin
     camera.distance = np.linalg.norm(shots.position[frame] - shots.target[frame])
     camera.azimuth = math.degrees(math.atan2(y, x))
     camera.elevation = math.degrees(math.asin(np.clip(z, -1.0, 1.0)))
-
-
-def _pose(model: mujoco.MjModel, data: mujoco.MjData, film: Film, frame: int) -> None:
-    """Puts the robots where they are in a frame."""
-    for k, one in enumerate(film.robots):
-        own = robot_qpos(model, data, k)
-        own[:] = one.qpos[frame]
-        own[:3] -= film.origin
-
-
-def _arrange(
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    scene: mujoco.MjvScene,
-    film: Film,
-    groups: np.ndarray,
-    frame: int,
-) -> None:
-    """Puts robots, camera and light in their places; hides robots that are not alive."""
-    owner = model.body_rootid[model.geom_bodyid]
-    for k, one in enumerate(film.robots):
-        own = owner == model.jnt_bodyid[model.joint(f"{k}/root").id]
-        model.geom_group[own] = groups[own] if one.alive[frame] else _HIDDEN
-    _pose(model, data, film, frame)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_camlight(model, data)
-    camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
-    _aim(camera, film, frame)
     mujoco.mjv_updateScene(model, data, option, None, camera, mujoco.mjtCatBit.mjCAT_ALL, scene)
     # The shadow map is spread around the sun's own place: close to the robot it is fine.
-    sun = film.center[frame] - film.origin + 4.0 * film.shots.distance * np.array(SUN)
+    sun = film.center[frame] - film.origin + 4.0 * shots.distance * np.array(SUN)
     for light in scene.lights[: scene.nlight]:
         if light.castshadow:
             light.pos[:] = sun

@@ -17,7 +17,7 @@ from mjx_revolve.view.motion import smooth_path, speed_over, stroke_period
 from mjx_revolve.view.poses import finite_rows, pose_robot
 from mjx_revolve.view.recording import Mark, Recording, interpolate_poses
 from mjx_revolve.view.surroundings import bed_at, target_name, target_of, water_at, water_velocity
-from mjx_revolve.water.flow import Water, water_of
+from mjx_revolve.water.flow import Water
 from mjx_revolve.water.world import World
 
 # Factor by which ripples around many robots, seen from the air, are smaller than by the camera's
@@ -195,11 +195,7 @@ def make_colony_film(
         for one, start, stop in zip(recording.robots, starts, ends, strict=True)
     )
     world = robots[0].robot.world
-    surface, current, acceleration, _ = water_of(world)
-    fill = lambda x: np.full(len(time), x, np.float32)  # noqa: E731
-    water = Water(
-        fill(surface), tuple(map(fill, current)), tuple(map(fill, acceleration)), fill(0) + time
-    )
+    water = water_at(world, np.zeros(len(time), int), time, 1)  # the same at any time
     shots = plan_circle(
         time,
         np.stack([one.qpos[:, :3] for one in robots]),

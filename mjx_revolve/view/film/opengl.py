@@ -48,7 +48,8 @@ def find_opengl() -> str:
         if wish not in ways:
             raise InputError("MUJOCO_GL", f"one of {', '.join(ways)}", repr(wish))
         ways = (wish,)
-    if system == "linux" and not _has_display() and not wish:
+    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if system == "linux" and not display and not wish:
         ways = tuple(way for way in ways if way != "glfw")
     for way in ways:
         if _works(way):
@@ -61,16 +62,11 @@ def find_opengl() -> str:
     )
 
 
-def _has_display() -> bool:
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
 def _works(way: str) -> bool:
     """Whether a context can be made so, tried in a process of its own."""
-    known = ("PYOPENGL_PLATFORM", "MUJOCO_GL")
-    environment = {name: value for name, value in os.environ.items() if name not in known}
     # MuJoCo's own choice at import is harmless and of no interest: ours follows.
-    environment["MUJOCO_GL"] = "disable"
+    environment = {**os.environ, "MUJOCO_GL": "disable"}
+    environment.pop("PYOPENGL_PLATFORM", None)
     try:
         done = subprocess.run(
             [sys.executable, "-P", "-c", _PROBE, way],

@@ -204,12 +204,11 @@ class Pen:
 
     def title(self, words: str) -> None:
         """At the top, as much as there is room for."""
-        words = " ".join(words.split())  # an id may have line breaks
-        room, full = self.width - 2 * self.edge, words
-        while words and self.bold.getlength(words if words == full else words + "…") > room:
+        words = shown = " ".join(words.split())  # an id may have line breaks
+        while words and self.bold.getlength(shown) > self.width - 2 * self.edge:
             words = words[:-1]
-        words = words if words == full else words + "…"
-        self.write(self.edge, self.edge, words, "la", _WHITE, bold=True)
+            shown = words + "…"
+        self.write(self.edge, self.edge, shown, "la", _WHITE, bold=True)
 
     def arrow(self, middle: np.ndarray, along: np.ndarray, color: Any) -> None:
         """An arrow around a place [pixels]."""

@@ -64,17 +64,16 @@ def build_stage(
     for number, robot in robots.items():
         frame = spec.worldbody.add_frame()
         spec.attach(_dressed(robot), prefix=f"{number}/", frame=frame)
-    place = np.asarray(origin, float)
-    _add_bed(spec, world, place, way, sight)
+    _add_bed(spec, world, np.asarray(origin, float), way, sight)
     _add_light(spec, size, way, sight)
     for geom in spec.geoms:  # nothing touches anything
         geom.contype = geom.conaffinity = 0
     return spec.compile()
 
 
-def robot_qpos(model: mujoco.MjModel, data: mujoco.MjData, number: int) -> np.ndarray:
+def robot_qpos(data: mujoco.MjData, number: int) -> np.ndarray:
     """A view of a robot's qpos in the data of a model from `build_stage`."""
-    root = model.joint(f"{number}/root")
+    model, root = data.model, data.model.joint(f"{number}/root")
     begin, owner = int(root.qposadr[0]), model.body_rootid[model.jnt_bodyid]
     count = 6 + int((owner == owner[root.id]).sum())
     return data.qpos[begin : begin + count]
@@ -146,13 +145,8 @@ def _add_bed(
     # The innermost ring is a point.
     outward, inward = np.stack([a, c, d], -1), np.stack([a, d, b], -1)[1:]
     faces = np.concatenate([outward.reshape(-1, 3), inward.reshape(-1, 3)])
-    texture = spec.add_texture(
-        name="sand",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        width=_TEXELS,
-        height=_TEXELS,
-        nchannel=3,
-    )
+    kind = mujoco.mjtTexture.mjTEXTURE_2D
+    texture = spec.add_texture(name="sand", type=kind, width=_TEXELS, height=_TEXELS, nchannel=3)
     texture.data = make_sand(_TEXELS).tobytes()
     material = spec.add_material(name="sand", specular=0.0, shininess=0.0)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "sand"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import Annotated
+from typing import Annotated, get_args
 
 from annotated_types import Ge, Le, Unit
 
@@ -83,10 +83,7 @@ class Reset:
 
 
 Command = Drop | Remove | Current | Pause | Rate | Reset
-_COMMANDS: dict[str, type] = {
-    "drop": Drop, "remove": Remove, "current": Current, "pause": Pause, "rate": Rate,
-    "reset": Reset,
-}  # fmt: skip
+_COMMANDS: dict[str, type] = {kind.__name__.lower(): kind for kind in get_args(Command)}
 
 
 def read_command(data: object) -> Command:

@@ -119,19 +119,20 @@ class _Handler(BaseHTTPRequestHandler):
             )
             return
         text = self.rfile.read(size)
+        origin, kind = self.headers.get("Origin"), self.headers.get_content_type()
         if self._place() != "command":
             self._refuse(HTTPStatus.NOT_FOUND, "expected the page's own address; found another")
-            return
-        origin = self.headers.get("Origin")
-        if origin is not None and origin not in self.server.origins:
+        elif origin is not None and origin not in self.server.origins:
             self._refuse(HTTPStatus.FORBIDDEN, f"Origin: expected our own page; found {origin!r}")
-            return
-        kind = self.headers.get_content_type()
-        if kind != "application/json":  # what another page may post without asking first
+        elif kind != "application/json":  # what another page may post without asking first
             self._refuse(
                 HTTPStatus.UNSUPPORTED_MEDIA_TYPE, f"expected application/json; found {kind}"
             )
-            return
+        else:
+            self._obey(text)
+
+    def _obey(self, text: bytes) -> None:
+        """Does what was posted, and answers."""
         try:
             command = read_command(_read_json(text))
             answer = self.server.simulation.ask(command).result(_ANSWER_TIMEOUT)

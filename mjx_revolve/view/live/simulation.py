@@ -182,18 +182,16 @@ class LiveSimulation:
 
     def state_event(self) -> str:
         """The event with the state that all pages show."""
-        return _event(
-            "state",
-            {
-                "time": round(self.time, 4),
-                "paused": self.paused,
-                "rate": self.rate,
-                "speed": round(self._speed, 3),
-                "current": [*self.current],
-                "busy": round(self.busy, 1),
-                "waves": pack_waves(self.world),
-            },
-        )
+        state = {
+            "time": round(self.time, 4),
+            "paused": self.paused,
+            "rate": self.rate,
+            "speed": round(self._speed, 3),
+            "current": [*self.current],
+            "busy": round(self.busy, 1),
+            "waves": pack_waves(self.world),
+        }
+        return _event("state", state)
 
     # ------------------------------------------------------------------ in its own thread
 
@@ -297,10 +295,9 @@ class LiveSimulation:
                     self._drop(drop)
         return None
 
-    def _set_current(self, velocity: Sequence[float]) -> None:
+    def _set_current(self, velocity: tuple[float, float, float]) -> None:
         self._tank.set_current(velocity)
-        x, y, z = velocity
-        self.current = (x, y, z)
+        self.current = velocity
 
     def _drop(self, command: Drop) -> int:
         if command.entry >= len(self.catalogue):
@@ -375,33 +372,29 @@ class LiveSimulation:
         return _event("bodies", bodies)
 
     def _cast_event(self) -> str:
-        return _event(
-            "cast",
-            [
-                {
-                    "key": one.key,
-                    "name": one.name,
-                    "body": one.body,
-                    "born": round(one.born, 3),
-                    "start": [round(x, 4) for x in one.start],
-                }
-                for one in self.robots
-            ],
-        )
+        cast = [
+            {
+                "key": one.key,
+                "name": one.name,
+                "body": one.body,
+                "born": round(one.born, 3),
+                "start": [round(x, 4) for x in one.start],
+            }
+            for one in self.robots
+        ]
+        return _event("cast", cast)
 
 
 def _poses_event(times: Iterable[float], rows: dict[int, np.ndarray]) -> str:
     """Poses `[T, width]` by key, at times `[T]` [s]."""
     numbers = np.concatenate([x.ravel() for x in rows.values()]) if rows else np.zeros(0)
-    return _event(
-        "poses",
-        {
-            "t": [round(float(t), 4) for t in times],
-            "keys": list(rows),
-            "widths": [x.shape[1] for x in rows.values()],
-            "q": base64.b64encode(numbers.astype("<f4").tobytes()).decode(),
-        },
-    )
+    poses = {
+        "t": [round(float(t), 4) for t in times],
+        "keys": list(rows),
+        "widths": [x.shape[1] for x in rows.values()],
+        "q": base64.b64encode(numbers.astype("<f4").tobytes()).decode(),
+    }
+    return _event("poses", poses)
 
 
 def _event(name: str, data: object) -> str:
