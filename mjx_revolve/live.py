@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from mjx_revolve.inputs.commands import Parser, program, read_path, run_command, whole
 from mjx_revolve.inputs.errors import plain
 from mjx_revolve.inputs.trust import add_trust_argument, opening
+from mjx_revolve.numerics.runtime import prepare_process
 
 if TYPE_CHECKING:
     from mjx_revolve.view.live.simulation import LiveSimulation
@@ -62,8 +63,6 @@ def main(argv: list[str] | None = None) -> int:
     )  # fmt: skip
     add_trust_argument(parser)
     arguments = parser.parse_args(argv)
-    from mjx_revolve.numerics.runtime import prepare_process
-
     prepare_process()
     from mjx_revolve.episodes.tank import make_tank
     from mjx_revolve.view.live.page import live_page

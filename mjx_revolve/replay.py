@@ -32,6 +32,7 @@ from mjx_revolve.inputs.commands import (
 from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import short_path
 from mjx_revolve.inputs.packages import check_package
+from mjx_revolve.numerics.runtime import fix_threads, prepare_process
 from mjx_revolve.view.film.opengl import find_opengl
 
 if TYPE_CHECKING:
@@ -157,16 +158,12 @@ def main(argv: list[str] | None = None) -> int:
     """
     arguments = _parser().parse_args(argv)
     path, out = Path(arguments.path), arguments.out
-    kinds = (".html",) if arguments.html else _KINDS
-    if arguments.ancestors is not None:
-        kinds = (".mp4", ".gif")
-        if arguments.html:
-            raise InputError("--ancestors: expected no --html: it makes a film")
-    if arguments.colony:
-        kinds = (".mp4", ".gif")
-        if arguments.html or arguments.ancestors is not None:
-            raise InputError("--colony", "neither --html nor --ancestors", "one")
     several = arguments.colony or arguments.ancestors is not None
+    if arguments.ancestors is not None and arguments.html:
+        raise InputError("--ancestors: expected no --html: it makes a film")
+    if arguments.colony and (arguments.html or arguments.ancestors is not None):
+        raise InputError("--colony", "neither --html nor --ancestors", "one")
+    kinds = (".html",) if arguments.html else (".mp4", ".gif") if several else _KINDS
     arguments.size = arguments.size or (_WIDE if arguments.colony else _USUAL)
     name = "colony" if arguments.colony else individual_name(arguments.individual) or "swim"
     if arguments.ancestors is not None:
@@ -181,8 +178,6 @@ def main(argv: list[str] | None = None) -> int:
     check_colony_arguments(arguments)
     if ".mp4" in (kinds if paths is None else paths):
         check_package("MP4", "av")
-    from mjx_revolve.numerics.runtime import fix_threads, prepare_process
-
     fix_threads()
     from mjx_revolve.episodes.early_checks import check_episode_files
 
@@ -213,7 +208,9 @@ def main(argv: list[str] | None = None) -> int:
             made = [make_film(episode, arguments.size, arguments.fps)]
     paths = paths or {}
     for film in made:
-        _warn(film)
+        if film.lost is not None:
+            words = f"the trajectory is not finite from {film.lost:.4g} s on; shown up to there"
+            print(f"note: {words}", file=sys.stderr)
     if made:
         from mjx_revolve.view.film.video import write_film
 
@@ -263,15 +260,6 @@ def _colony_films(arguments: argparse.Namespace, _: Path | None) -> list[Film]:
     path, duration = Path(arguments.path), arguments.duration or DURATION
     recording = record_colony(path, arguments.time, duration)
     return [make_colony_film(recording, arguments.size, arguments.fps)]
-
-
-def _warn(film: Film) -> None:
-    """Says what is not shown."""
-    if film.lost is not None:
-        print(
-            f"note: the trajectory is not finite from {film.lost:.4g} s on; shown up to there",
-            file=sys.stderr,
-        )
 
 
 def _say_films(paths: dict[str, Path], films: Sequence[Film]) -> None:

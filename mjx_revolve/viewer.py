@@ -27,6 +27,7 @@ from mjx_revolve.inputs.commands import (
 )
 from mjx_revolve.inputs.errors import plain
 from mjx_revolve.inputs.files import PAGES, check_name, short_path
+from mjx_revolve.numerics import runtime
 from mjx_revolve.view.viewer import write_colony_page, write_viewer
 
 
@@ -72,15 +73,13 @@ def main(argv: list[str] | None = None) -> int:
     if arguments.colony:
         return _write_colony(arguments)
     # JAX takes seconds to import: not for `--help`, nor for wrong files.
-    from mjx_revolve.numerics.runtime import fix_threads, prepare_process
-
-    fix_threads()
+    runtime.fix_threads()
     from mjx_revolve.episodes.early_checks import check_episode_files
 
     check_episode_files(arguments)
     from mjx_revolve.episodes.champion import load_asked
 
-    prepare_process()
+    runtime.prepare_process()
     episode = load_asked(arguments)
     name = individual_name(arguments.individual) or "viewer"
     out = arguments.out or _usual_path(episode.folder, name, episode.robot.morphology.name)
@@ -95,10 +94,9 @@ def _write_colony(arguments: argparse.Namespace) -> int:
     """Writes the page of a whole colony."""
     folder = Path(arguments.path)
     out = Path(arguments.out) if arguments.out else _usual_path(folder, "colony", "colony")
-    from mjx_revolve.numerics.runtime import prepare_process
     from mjx_revolve.view.colony import DURATION, record_colony
 
-    prepare_process()
+    runtime.prepare_process()
     with opening_episode(arguments):
         seen = record_colony(folder, arguments.time, arguments.duration or DURATION)
     written = write_colony_page(

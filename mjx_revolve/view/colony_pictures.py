@@ -167,8 +167,7 @@ def plot_families(history: ColonyHistory, champion: int | None = None, title: st
     rest = history.count_living(times) - sum(counts, np.zeros(len(times)))
     top.stackplot(times / scale, [*counts, rest], labels=[*(f"of #{f}" for f in shown), "others"],
                   colors=[*colors.values(), _REST], linewidth=0, alpha=0.9)  # fmt: skip
-    top.set_ylabel("robots alive")
-    top.set_ylim(bottom=0)
+    top.set(ylabel="robots alive", ylim=(0, None))
     legend_above(top, 0.0)
     row = {span.number: k for k, span in enumerate(spans)}
     width = float(np.clip(330.0 / max(len(spans), 1), _THIN, _THICK))

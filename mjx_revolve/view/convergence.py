@@ -192,9 +192,7 @@ def plot_colony(metrics: Metrics, title: str = "") -> Figure:
 
 
 def draw_curves(
-    axes: Axes,
-    cases: Mapping[str, Sequence[Curve]],
-    numbers: Sequence[int] | None = None,
+    axes: Axes, cases: Mapping[str, Sequence[Curve]], numbers: Sequence[int] | None = None
 ) -> None:
     """Draws the best score so far of each case: mean over the seeds, its band, and each seed.
 
@@ -236,9 +234,8 @@ def draw_scores(
         groups: values by case; the names are the ticks.
         numbers: of the cases, for their colours; None: as they come.
     """
-    for k, (number, values) in enumerate(
-        zip(numbers or range(len(groups)), groups.values(), strict=True)
-    ):
+    numbers = numbers or range(len(groups))
+    for k, (number, values) in enumerate(zip(numbers, groups.values(), strict=True)):
         color = COLORS[number % len(COLORS)]
         reach = min(0.03 * (len(values) - 1), 0.2)
         axes.plot(k - 0.1 + np.linspace(-reach, reach, len(values)), values, "o", color=color,
@@ -317,6 +314,6 @@ def plot_cases(
     left.set(xlabel=over, ylabel=best, title="mean over seeds and 95 % confidence band")
     legend_outside(figure, left, 2 if len(curves) <= _MOST_NAMED else 8)
     draw_scores(right, {letter(k): own for k, own in scores.items()}, list(scores))
-    right.set(ylabel=f"champion's score ({unit})" if unit else "champion's score")
-    right.set_title("final, on fresh starts")
+    score = f"champion's score ({unit})" if unit else "champion's score"
+    right.set(ylabel=score, title="final, on fresh starts")
     return figure

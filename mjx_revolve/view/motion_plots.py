@@ -109,8 +109,7 @@ def plot_path(
         over = speed_over(time, path)[rows]
         speed.plot(time[rows], over, color=ORANGE, linewidth=1.8, label="over 1 s")
         legend_above(speed)
-    speed.set_ylabel("speed (m/s)")
-    speed.set_ylim(bottom=0)
+    speed.set(ylabel="speed (m/s)", ylim=(0, None))
     for axes in (depth, speed):
         axes.set(xlabel="time (s)", xlim=(time[0], max(time[-1], time[0] + 1e-6)))
     return figure
@@ -156,8 +155,7 @@ def plot_champions(groups: Sequence[tuple[str, int, Sequence[Motion]]]) -> Figur
         axes.locator_params(nbins=5)
         axes.set_aspect("equal", adjustable="datalim")
     away.set(xlabel="time (s)", ylabel="distance from the start (m)", title="mean and 95 % band")
-    away.set_xlim(left=0)
-    away.set_ylim(bottom=0)
+    away.set(xlim=(0, None), ylim=(0, None))
     if len(groups) > 1:
         legend_outside(figure, away, 2)
     return figure
@@ -239,17 +237,15 @@ def plot_energy(motion: Motion) -> Figure:
     rate = mean_rate(motion.time, motion.energy)[rows]
     left.plot(time, rate, color=ORANGE, linewidth=1.7, label="over 1 s")
     # A lone spike at the start must not press the rest flat.
-    left.set_ylim(0, 1.12 * max(float(np.percentile(motion.power, 99.5)), 1e-9))
-    left.set_ylabel("power (W)")
+    most = max(float(np.percentile(motion.power, 99.5)), 1e-9)
+    left.set(ylabel="power (W)", ylim=(0, 1.12 * most))
     legend_above(left)
     middle.plot(time, energy, color=BLUE, linewidth=1.7)
-    middle.set_ylim(bottom=0)
-    middle.set_ylabel("energy so far (J)")
+    middle.set(ylabel="energy so far (J)", ylim=(0, None))
     middle.set_title(f"{energy[-1]:.3g} J in {time[-1]:.3g} s")
     right.plot(time, motion.costs[rows], color=GREEN, linewidth=1.5)
     right.axvline(motion.counted_from, color=PALE, linewidth=1.0, linestyle=(0, (3, 2)))
-    right.set_ylim(0, 2.2 * max(motion.cost, 1e-6))
-    right.set_ylabel("cost of transport (–)")
+    right.set(ylabel="cost of transport (–)", ylim=(0, 2.2 * max(motion.cost, 1e-6)))
     right.set_title(f"{motion.cost:.3g} at the end")
     for axes in (left, middle, right):
         axes.set(xlabel="time (s)", xlim=(0, time[-1]))

@@ -165,9 +165,9 @@ def legend_above(axes: Axes, side: float = 1.0) -> None:
 def legend_outside(figure: Figure, axes: Axes, columns: int, where: str = "lower center") -> None:
     """Puts one legend for all axes, that of `axes`, beside them."""
     handles, labels = axes.get_legend_handles_labels()
-    look: dict[str, Any] = {"loc": f"outside {where}", "ncols": min(columns, len(labels))}
+    place: Any = f"outside {where}"
     if labels:
-        figure.legend(handles, labels, **look)
+        figure.legend(handles, labels, loc=place, ncols=min(columns, len(labels)))
 
 
 def color_bar(

@@ -80,7 +80,8 @@ def trace_sensors(
         np.concatenate([np.zeros_like(trajectory.qvel[:1]), trajectory.qvel]),
         np.asarray(trajectory.ctrl)[:, actuators_of(robot)],
         np.asarray(trajectory.power),
-        jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), _long(x, steps))[:steps], water),
+        # A number, or a row for each step of the whole episode.
+        jax.tree.map(lambda x: np.broadcast_to(x, (max(np.size(x), steps),))[:steps], water),
     )
     found = _compiled(fitness, steps)(
         jax.tree.map(lambda x: jnp.asarray(x, start.dtype), rows),
@@ -115,11 +116,6 @@ def trace_sensors(
             rate = sensor.rate or fitness.controller.rate
             traces.append(SensorTrace(sensor, names, a / scale + zero, b, rate))
     return tuple(traces)
-
-
-def _long(x: Any, steps: int) -> tuple[int, ...]:
-    """The shape of a number or `[T]` as rows of an episode, at least as many as there are."""
-    return (max(np.size(x), steps),)
 
 
 def _split(

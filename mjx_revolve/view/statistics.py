@@ -108,8 +108,7 @@ def mean_and_half(rows: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Returns:
         `[...]` each; NaN where there are too few values.
     """
-    x = np.asarray(rows, float)
-    x = np.ma.masked_invalid(x)
+    x = np.ma.masked_invalid(np.asarray(rows, float))
     count = np.asarray(x.count(axis=0))
     error = np.sqrt(x.var(axis=0, ddof=1) / np.maximum(count, 1))
     half = stats.t.ppf(0.5 + LEVEL / 2, np.maximum(count - 1, 1)) * np.ma.filled(error, np.nan)

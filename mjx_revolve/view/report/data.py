@@ -10,7 +10,6 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -49,8 +48,7 @@ def read_run(folder: str | Path) -> RunRecord:
     """
     path = check_path(folder)
     if not path.is_dir():
-        found = "a file" if path.exists() else "none"
-        raise InputError(path, "a run folder", found)
+        raise InputError(path, "a run folder", "a file" if path.exists() else "none")
     with suppress(InputError):  # without a config.yaml, the rest is read
         path = find_run(path)
     label = str(path) if str(path) not in (".", "..") else path.resolve().name
@@ -65,8 +63,7 @@ def read_run(folder: str | Path) -> RunRecord:
     _read_champion(record)
     _check_end(record)
     _check_versions(record)
-    anything = (record.info, record.settings, record.metrics, record.genes is not None)
-    if not any(anything):
+    if not (record.info or record.settings or record.metrics or record.genes is not None):
         found = "; ".join(problem.text for problem in record.problems if problem.kind == "damaged")
         raise InputError(folder, "a run folder", found or "nothing of a run")
     return record
@@ -121,7 +118,6 @@ def _read_config(record: RunRecord) -> None:
     if not path.is_file():
         record.note("missing", "config.yaml is missing: neither settings nor a replay")
         return
-    data: Any = None
     with record.noting_damage():
         data = load_yaml(path)
         if not isinstance(data, dict) or not data:
@@ -130,7 +126,8 @@ def _read_config(record: RunRecord) -> None:
     if not record.settings:
         return
     try:
-        known = with_older_values(locate_files(data, find_copies(record.folder)), record.folder)
+        known = locate_files(record.settings, find_copies(record.folder))
+        known = with_older_values(known, record.folder)
         record.config = make_config(known, record.folder, source=str(path))
     except InputError as error:
         kinds = {"found none": "missing", "unknown key": "version"}
@@ -176,14 +173,13 @@ def _read_population(record: RunRecord) -> None:
     if not record.settings.get("bodies") and not (record.folder / INDIVIDUALS).is_file():
         return
     record.population, problems = read_population(record.folder)
-    for problem in problems:
-        record.note("damaged", problem)
     if record.settings.get("colony") or (record.folder / EVENTS).is_file():
         time = record.metrics.get("time", np.zeros(0))
         until = time[np.isfinite(time)].max(initial=0.0)
-        record.history, problems = read_history(record.folder, float(until))
-        for problem in problems:
-            record.note("damaged", problem)
+        record.history, more = read_history(record.folder, float(until))
+        problems += more
+    for problem in problems:
+        record.note("damaged", problem)
     if not record.population.lives:
         record.note("missing", f"{INDIVIDUALS} is empty: neither bodies nor families")
 
@@ -234,13 +230,6 @@ def _check_end(record: RunRecord) -> None:
                     "champion is not evaluated on fresh starts")  # fmt: skip
 
 
-def _version(package: str) -> str:
-    """Of a package here; "" where it is not installed, as a checkout of ours need not be."""
-    if package == "mjx_revolve":
-        return mjx_revolve.__version__
-    return installed_version(package)
-
-
 def _numbers(version: str) -> list[int]:
     return [int(part) for part in re.findall(r"\d+", version)]
 
@@ -254,7 +243,9 @@ def _check_versions(record: RunRecord) -> None:
         return
     found = []
     for name in _PACKAGES:
-        before, now = versions.get(name), _version(name)
+        before, now = versions.get(name), installed_version(name)
+        if name == "mjx_revolve":  # a checkout of ours need not be installed
+            now = mjx_revolve.__version__
         if isinstance(before, str) and now and before != now:
             age = "older" if _numbers(before) < _numbers(now) else "newer"
             found.append(f"{age} {name} {before} (here {now})")

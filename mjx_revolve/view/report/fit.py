@@ -24,10 +24,11 @@ def make_fit_page(fit: Fit) -> str:
         A complete HTML document that needs no other file.
     """
     problem = fit.problem
+    unknown = sections.fit_unknown([u.words for u in fit.unknown], fit.advice)
     content = [
         ("predictions", "Predicted beside recorded", _predictions(fit)),
         ("coefficients", "What was found", _values(fit)),
-        ("unknown", "What the recordings do not determine", _unknown(fit)),
+        ("unknown", "What the recordings do not determine", unknown),
         ("recordings", "Recordings", _recordings(fit)),
         ("use", "Use it", sections.fit_use(problem.robot.morphology.name)),
     ]
@@ -81,8 +82,7 @@ def plot_prediction(p: Prediction) -> Figure:
         for k, axis in zip(seen, axes, strict=True):
             axis.plot(p.time[rows], track[rows, k], color=color, lw=width, alpha=alpha)
     above.set_aspect("equal", adjustable="datalim")
-    above.set_xlabel("x (m)")
-    above.set_ylabel("y (m)")
+    above.set(xlabel="x (m)", ylabel="y (m)")
     above.legend(loc="best")
     for k, axis in zip(seen, axes, strict=True):
         axis.set_ylabel(f"{'xyz'[k]} (m)")
@@ -102,14 +102,12 @@ def plot_speeds(predictions: list[Prediction]) -> Figure:
     axis = figure.subplots()
     for name, color in (("before", ORANGE), ("fitted", BLUE)):
         for p in predictions:
-            full = {} if p.held.all() else {"color": color}
-            axis.plot(p.recorded[-1, 0], getattr(p, name)[-1, 0], "o", mec=color,
-                      mfc=full.get("color", "none"), ls="none")  # fmt: skip
+            fill = "none" if p.held.all() else color
+            axis.plot(p.recorded[-1, 0], getattr(p, name)[-1, 0], "o", mec=color, mfc=fill)
         axis.plot([], [], "o", color=color, label=name)
     most = max(float(np.nanmax([p.recorded[-1, 0], p.fitted[-1, 0]])) for p in predictions)
     axis.plot([0, most], [0, most], color=GREY, lw=0.8)
-    axis.set_xlabel("recorded (m/s); rings: held out")
-    axis.set_ylabel("simulated (m/s)")
+    axis.set(xlabel="recorded (m/s); rings: held out", ylabel="simulated (m/s)")
     axis.legend()
     return figure
 
@@ -126,10 +124,6 @@ def _values(fit: Fit) -> str:
     ]
     header = ("number", "found\nfactor, or as said", f"interval\n{LEVEL:.0%}", "before\n95 %")
     return sections.fit_table(header, rows)
-
-
-def _unknown(fit: Fit) -> str:
-    return sections.fit_unknown([u.words for u in fit.unknown], fit.advice)
 
 
 def _recordings(fit: Fit) -> str:

@@ -226,9 +226,8 @@ def _replay(
                 record.note("untrusted", f"no replay: {error}")
             except InputError as error:
                 record.note("damaged", f"no replay: {error}")
-        best = group.best()
-        if best is not None and best.folder in bodies:
-            robots.append((group.name, bodies[best.folder]))
+        if (best := group.best().folder) in bodies:
+            robots.append((group.name, bodies[best]))
     return replays, robots
 
 
@@ -334,13 +333,12 @@ def _robots(found: Sequence[tuple[str, Morphology]]) -> str:
     several = len({morphology.name for _, morphology in found}) > 1
     seen: list[Morphology] = []
     for name, morphology in found:
-        if any(morphology == other for other in seen):
+        if morphology in seen:
             continue
         seen.append(morphology)
-        counts = morphology.counts
         rows, foot = tables.count_modules(morphology)
         entries.append({
-            "heading": f"{morphology.title}: {counts}" + (f" ({name})" if several else ""),
+            "heading": f"{morphology.title}: {morphology.counts}{f' ({name})' * several}",
             "rows": rows, "foot": foot, "modules": tables.list_modules(morphology),
             "descriptors": tables.list_descriptors(morphology),
         })  # fmt: skip
