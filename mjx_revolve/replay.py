@@ -176,14 +176,15 @@ def main(argv: list[str] | None = None) -> int:
         check_place(folder / name, str(folder))
     check_episode_path(path)
     check_colony_arguments(arguments)
-    if ".mp4" in (kinds if paths is None else paths):
+    wanted = kinds if paths is None else paths
+    if ".mp4" in wanted:
         check_package("MP4", "av")
     fix_threads()
     from mjx_revolve.episodes.early_checks import check_episode_files
 
     check_episode_files(arguments)
     # Before anything imports MuJoCo, which looks for OpenGL at once and stumbles over it.
-    films = set(kinds if paths is None else paths) != {".html"}
+    films = set(wanted) != {".html"}
     opengl = find_opengl() if films else ""
 
     prepare_process()
@@ -226,11 +227,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _ancestor_films(arguments: argparse.Namespace, folder: Path | None) -> list[Film]:
     """Films of an individual and its ancestors, the oldest first."""
-    from mjx_revolve.episodes.champion import (
-        champion_number,
-        load_individuals,
-        read_individuals,
-    )
+    from mjx_revolve.episodes.champion import champion_number, load_individuals, read_individuals
     from mjx_revolve.episodes.early_checks import refuse_world
     from mjx_revolve.view.film.film import make_film
     from mjx_revolve.view.population import pick_ancestors, read_population

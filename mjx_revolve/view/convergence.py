@@ -29,6 +29,7 @@ from mjx_revolve.view.plots import (
     new_figure,
     style_of,
     whole_numbers,
+    with_unit,
 )
 from mjx_revolve.view.statistics import FEWEST, interval, mean_and_half
 
@@ -314,6 +315,5 @@ def plot_cases(
     left.set(xlabel=over, ylabel=best, title="mean over seeds and 95 % confidence band")
     legend_outside(figure, left, 2 if len(curves) <= _MOST_NAMED else 8)
     draw_scores(right, {letter(k): own for k, own in scores.items()}, list(scores))
-    score = f"champion's score ({unit})" if unit else "champion's score"
-    right.set(ylabel=score, title="final, on fresh starts")
+    right.set(ylabel=with_unit("champion's score", unit), title="final, on fresh starts")
     return figure

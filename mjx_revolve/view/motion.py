@@ -45,14 +45,12 @@ class Motion:
     Attributes:
         robot: that moved.
         length: of its body, as the task has it [m].
-        weight: in air [N].
         time: `[T]` [s].
         qpos: `[T, nq]` as in a trajectory.
         path: `[T, 3]` of the core, world frame [m].
         steady: `[T, 3]` the path without the to and fro of the strokes [m].
         along: `[2]` unit vector of the way in the horizontal plane; x where the robot stayed.
         surface: `[T]` z of the still surface, world frame [m].
-        depth: `[T]` of the core below it [m].
         period: of the strokes [s]; None where the hinges do not repeat themselves.
         poses: rows along the way at which poses do not overlap, see `choose_poses`.
         angles: `[T, nhinge]` of the joints in the order of the servos [rad].
@@ -77,14 +75,12 @@ class Motion:
 
     robot: Robot
     length: float
-    weight: float
     time: np.ndarray
     qpos: np.ndarray
     path: np.ndarray
     steady: np.ndarray
     along: np.ndarray
     surface: np.ndarray
-    depth: np.ndarray
     period: float | None
     poses: list[int]
     angles: np.ndarray
@@ -166,14 +162,12 @@ def analyse_motion(
     return Motion(
         robot=robot,
         length=length,
-        weight=weight,
         time=time,
         qpos=qpos,
         path=path,
         steady=smooth_path(time, path, period),
         along=net / np.linalg.norm(net) if moved else np.array([1.0, 0.0]),
         surface=surface,
-        depth=surface - path[:, 2],
         period=period,
         poses=choose_poses(time, path, length),
         angles=qpos[:, robot.mj_model.jnt_qposadr[joints]],

@@ -61,19 +61,18 @@ class RobotMeshes:
 
     shapes: list[Packed] = field(default_factory=list)
     bodies: list[Packed] = field(default_factory=list)
-    _robots: dict[int, tuple[Robot, int]] = field(default_factory=dict)
+    _robots: dict[Robot, int] = field(default_factory=dict)
     _bodies: dict[str, int] = field(default_factory=dict)
     _shapes: dict[bytes, int] = field(default_factory=dict)
 
     def add(self, robot: Robot) -> int:
         """Index of a robot's body, which is added where it is new."""
-        if id(robot) not in self._robots:
+        if robot not in self._robots:
             data = self._body(robot)
-            number = self._bodies.setdefault(json.dumps(data), len(self.bodies))
-            if number == len(self.bodies):
+            self._robots[robot] = self._bodies.setdefault(json.dumps(data), len(self.bodies))
+            if self._robots[robot] == len(self.bodies):
                 self.bodies.append(data)
-            self._robots[id(robot)] = robot, number  # the robot is kept, so that its id is
-        return self._robots[id(robot)][1]
+        return self._robots[robot]
 
     def _body(self, robot: Robot) -> Packed:
         assembly = robot.assembly

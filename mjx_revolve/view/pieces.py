@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -157,21 +157,19 @@ def mount_piece(robot: Robot, piece: Piece) -> tuple[int, np.ndarray, np.ndarray
     return int(fluid.body[k]), fluid.position[k] - fluid.rotation[k] @ center, fluid.rotation[k]
 
 
-def place_pieces(
-    pieces: Sequence[Piece], place: Callable[[Piece], tuple[np.ndarray, np.ndarray]]
-) -> Scene:
+def place_pieces(pieces: Sequence[Piece], frames: Iterable[tuple[np.ndarray, np.ndarray]]) -> Scene:
     """Puts pieces together.
 
     Args:
         pieces: from `make_pieces`.
-        place: position `[3]` [m] and rotation `[3, 3]` of a piece's module frame in the world.
+        frames: of each piece position `[3]` [m] and rotation `[3, 3]` of its module's frame in the
+            world.
 
     Returns:
         The scene.
     """
     corners, color, part = [], [], []
-    for number, piece in enumerate(pieces):
-        position, rotation = place(piece)
+    for number, (piece, (position, rotation)) in enumerate(zip(pieces, frames, strict=True)):
         corners.append(piece.corners @ rotation.T + position)
         color.append(np.broadcast_to(piece.color, (len(piece.corners), 3)))
         part.append(np.full(len(piece.corners), number))
@@ -188,7 +186,8 @@ def rest_scene(morphology: Morphology) -> Scene:
         The scene, the core's frame at the world's origin.
     """
     frames = [(np.asarray(m.position), np.asarray(m.rotation)) for m in morphology.modules]
-    return place_pieces(make_pieces(morphology), lambda piece: frames[piece.module])
+    pieces = make_pieces(morphology)
+    return place_pieces(pieces, [frames[piece.module] for piece in pieces])
 
 
 def _spindle(axis: Sequence[float], profile: Sequence[tuple[float, float]]) -> np.ndarray:

@@ -63,6 +63,11 @@ def label_of(name: str) -> str:
     return LABELS.get(name, words if unit in ("-", "modules") else f"{words} ({unit})")
 
 
+def with_unit(words: str, unit: str) -> str:
+    """A name and its unit, where there is one."""
+    return f"{words} ({unit})" if unit else words
+
+
 def style_of(index: int) -> dict[str, Any]:
     """Colour and dash of the lines of a group of runs, by its number; colours vary first."""
     dash = _DASHES[(index // len(COLORS)) % len(_DASHES)]

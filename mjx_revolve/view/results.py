@@ -19,7 +19,7 @@ from mjx_revolve.view.colony_pictures import plot_history
 from mjx_revolve.view.convergence import plot_colony, plot_fitness
 from mjx_revolve.view.motion import counted_time
 from mjx_revolve.view.motion_plots import plot_trajectory
-from mjx_revolve.view.plots import figure_png
+from mjx_revolve.view.plots import figure_png, with_unit
 from mjx_revolve.view.surroundings import target_at_last
 from mjx_revolve.view.swim_picture import plot_swim
 
@@ -43,12 +43,11 @@ def save_pictures(run: Run, champion: Champion) -> None:
         OSError: the disk is full.
     """
     folder, fitness, config = run.folder, run.executor.fitness, run.config
-    unit = score_unit(config.task.type, config.task.unit)
     if config.bodies is not None:
         fitness = fitness.body_fitness(champion.body)
     title = f"{folder.path.name}: {describe_score(champion, config)}"
-    label = f"fitness ({unit})" if unit else "fitness"
     if config.colony is None:
+        label = with_unit("fitness", score_unit(config.task.type, config.task.unit))
         figures = {"fitness.png": plot_fitness(folder.load_metrics(), title, label)}
     else:
         title = f"{folder.path.name}: the champion swims {describe_score(champion, config)}"

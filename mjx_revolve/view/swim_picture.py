@@ -21,7 +21,7 @@ from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 from mjx_revolve.numerics.spatial import quat_to_matrix
 from mjx_revolve.view.motion import Motion, analyse_motion, stroke_rows
 from mjx_revolve.view.palette import ACCENT, CURRENT, RGB, SAND, TARGET
-from mjx_revolve.view.pieces import Piece, Scene, make_pieces, mount_piece, place_pieces
+from mjx_revolve.view.pieces import Scene, make_pieces, mount_piece, place_pieces
 from mjx_revolve.view.plots import INK, in_style, new_figure
 from mjx_revolve.view.poses import pose_robot
 from mjx_revolve.view.raster import make_view, show_scene
@@ -47,18 +47,12 @@ _SHORTER = 0.28  # share of the height that the lower of both views has at least
 def pose_scenes(robot: Robot, qpos: np.ndarray) -> list[Scene]:
     """The robot's parts in poses `qpos` `[S, nq]`: a scene for each, world frame [m]."""
     poses, pieces = pose_robot(robot, qpos), make_pieces(robot.morphology)
-    rotation = quat_to_matrix(poses.quaternion)
-    mounts = {id(piece): mount_piece(robot, piece) for piece in pieces}
-
-    def scene(k: int) -> Scene:
-        def place(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
-            body, position, turned = mounts[id(piece)]
-            frame = rotation[k, body]
-            return poses.position[k, body] + frame @ position, frame @ turned
-
-        return place_pieces(pieces, place)
-
-    return [scene(k) for k in range(len(qpos))]
+    mounts = [mount_piece(robot, piece) for piece in pieces]
+    scenes = []
+    for place, turn in zip(poses.position, quat_to_matrix(poses.quaternion), strict=True):
+        frames = [(place[k] + turn[k] @ at, turn[k] @ own) for k, at, own in mounts]
+        scenes.append(place_pieces(pieces, frames))
+    return scenes
 
 
 def plot_swim(

@@ -24,7 +24,7 @@ from mjx_revolve.evolution import archive as archives
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.archive_map import plot_archive
 from mjx_revolve.view.body_pictures import count_modules, draw_bodies, plot_descriptors
-from mjx_revolve.view.plots import figure_svg
+from mjx_revolve.view.plots import figure_svg, with_unit
 from mjx_revolve.view.population import LineageStep, pick_evenly, rank, trace_lineage
 from mjx_revolve.view.report.record import RunRecord
 from mjx_revolve.view.report.tables import format_number
@@ -202,7 +202,7 @@ def _draw_archive(
     links = {
         life.number: _page(record, life, at) or f"#{anchor(record, life.number)}" for life in elites
     }
-    label = f"score ({record.unit})" if record.unit else "score"
+    label = with_unit("score", record.unit)
     return figure_svg(plot_archive(archive, label, champion=_champion(record), links=links))
 
 

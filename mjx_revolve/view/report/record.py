@@ -20,6 +20,7 @@ from mjx_revolve.inputs.trust import UntrustedError
 from mjx_revolve.inputs.user_code import content_name
 from mjx_revolve.view.colony_history import ColonyHistory
 from mjx_revolve.view.convergence import COLONY_LABEL
+from mjx_revolve.view.plots import with_unit
 from mjx_revolve.view.population import Population
 
 # Kinds of problems, gravest first, and what they make of the run.
@@ -145,7 +146,7 @@ class RunRecord:
         """Name and unit of the fitness; in a colony it differs from its champion's score."""
         if self.history is not None:
             return COLONY_LABEL
-        return f"fitness ({self.unit})" if self.unit else "fitness"
+        return with_unit("fitness", self.unit)
 
     @property
     def round(self) -> str:

@@ -24,7 +24,7 @@ from mjx_revolve.view.outcomes import (
     find_outcomes,
     write_csv,
 )
-from mjx_revolve.view.plots import label_of, letter
+from mjx_revolve.view.plots import label_of, letter, with_unit
 from mjx_revolve.view.report.groups import setting_words
 from mjx_revolve.view.report.page import default_page, make_page, sections, svg_source
 from mjx_revolve.view.report.tables import format_number
@@ -201,7 +201,7 @@ def _scores(members: Numbered, cases: Sequence[str]) -> str:
     ]  # fmt: skip
     curves = {k: [(o.metrics["evaluations"], o.metrics["champion"]) for o in found]
               for k, found in members.items()}  # fmt: skip
-    best = f"best score so far ({unit})" if unit else "best score so far"
+    best = with_unit("best score so far", unit)
     figure = plot_cases(dict(enumerate(cases)), curves, scores, "evaluated individuals", best, unit)
     return sections.sweep_scores(header, rows, svg_source(figure))
 

@@ -13,7 +13,7 @@ from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.episodes.scoring import REPORT_EPISODES
 from mjx_revolve.view.colony_history import ColonyHistory
 from mjx_revolve.view.colony_pictures import cause_styles
-from mjx_revolve.view.plots import LABELS, label_of
+from mjx_revolve.view.plots import LABELS, label_of, with_unit
 from mjx_revolve.view.report.champion import ChampionReplay
 from mjx_revolve.view.report.groups import RunGroup, differences
 from mjx_revolve.view.report.record import RunRecord, number
@@ -206,8 +206,8 @@ def runs_table(groups: Sequence[RunGroup]) -> tuple[list[str], list[list[Cell]]]
 
 def measures_table(record: RunRecord, replay: ChampionReplay) -> list[tuple[str, str, str]]:
     """Rows of a champion's score and measures: in its episode, and over all fresh starts."""
-    unit = f" ({record.unit})" if record.unit else ""
-    return [(f"score{unit}", format_number(replay.score), _score(record))] + [
+    name = with_unit("score", record.unit)
+    return [(name, format_number(replay.score), _score(record))] + [
         (label_of(n), format_number(replay.measures[n]), format_number(_measure(record, n)))
         for n in LABELS if n in replay.measures
     ]  # fmt: skip
