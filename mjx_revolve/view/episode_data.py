@@ -77,7 +77,10 @@ def episode_data(episode: Episode, forces: bool = True) -> Packed:
     task = episode.fitness.config.task if episode.fitness else None
     target = target_of(task, trajectory)
     surface, begun = (_first(x) for x in (water.surface_height, water.time))
-    net = qpos[-1, :2] - qpos[0, :2]
+    net, lowest = qpos[-1, :2] - qpos[0, :2], float(qpos[:, 2].min())
+    moved = float(np.linalg.norm(net)) > 0.05 * length
+    fastest = float(np.linalg.norm(current, axis=1).max())
+    moving = {"fastest": fastest, "velocity": pack_floats(current)}
     data = replay_data(
         [ReplayRobot(episode.title, robot, time, qpos)], low - 0.1 * length, begun=begun
     )
@@ -88,25 +91,16 @@ def episode_data(episode: Episode, forces: bool = True) -> Packed:
             "step": step,
             "length": episode.length,
             # Direction of the way, from x towards y [deg]; a robot that stays is shown along y.
-            "heading": math.degrees(math.atan2(net[1], net[0]))
-            if float(np.linalg.norm(net)) > 0.05 * length
-            else 90.0,
+            "heading": math.degrees(math.atan2(net[1], net[0])) if moved else 90.0,
             "center": pack_floats(center),
             "speed": pack_floats(speed_over(time, qpos[:, :3], period)),
             "drift": pack_floats(water_drift(world, now, center, step)),
-            "current": {
-                "fastest": float(np.linalg.norm(current, axis=1).max()),
-                "velocity": pack_floats(current),
-            }
-            if is_moving(current)
-            else None,
+            "current": moving if is_moving(current) else None,
             "target": None if target is None else pack_floats(target[rows]),
             "target_name": target_name(task),
             "anchors": _anchors(robot),
             "forces": _arrows(episode, every, water) if forces else _no_arrows(_LEFT_OUT),
-            "deepest": max(
-                1.3 * (surface - float(qpos[:, 2].min())), surface - low, 1.5 * length
-            ),
+            "deepest": max(1.3 * (surface - lowest), surface - low, 1.5 * length),
         },
     }  # fmt: skip
 

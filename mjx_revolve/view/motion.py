@@ -156,6 +156,7 @@ def analyse_motion(
         water = jax.tree.map(lambda x: np.asarray(x)[:count] if np.ndim(x) else x, water)
     current = water_velocity(robot.world, water, path)
     drift = current[first:-1].sum(axis=0) * (seconds / max(count - 1 - first, 1))
+    swum = float(np.linalg.norm(scored[-1] - scored[first] - drift))
     # A millimetre bounds the cost where the robot stays, as in `measures.measure`.
     costs = (energy - energy[first]) / (weight * np.maximum(away, 1e-3))
     far = away > _MIN_DISTANCE * max(float(away[first:].max()), 1e-3)
@@ -182,9 +183,7 @@ def analyse_motion(
         distance=distance,
         speed=distance / seconds if seconds > 0.0 else 0.0,
         current=current,
-        water_speed=float(np.linalg.norm(scored[-1] - scored[first] - drift)) / seconds
-        if seconds > 0.0
-        else 0.0,
+        water_speed=swum / seconds if seconds > 0.0 else 0.0,
         target=target,
         target_name=target_name(task),
         cost=float(costs[-1]),

@@ -139,17 +139,12 @@ def whole_numbers(axes: Axes, count: int = 6) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10], nbins=count))
 
 
-def panels(
-    figure: Figure,
-    count: int,
-    columns: int,
-    xlabel: str = "",
-    sharex: bool = False,
-    sharey: bool = False,
-) -> list[Axes]:
-    """So many axes in rows of `columns`; the lowest of each column has the label `xlabel`."""
-    lines = -(-count // columns)
-    grid = figure.subplots(lines, columns, squeeze=False, sharex=sharex, sharey=sharey).ravel()
+def panels(figure: Figure, count: int, columns: int, xlabel: str = "", **share: Any) -> list[Axes]:
+    """So many axes in rows of `columns`; the lowest of each column has the label `xlabel`.
+
+    `share` are arguments of matplotlib's `subplots`: `sharex`, `sharey`.
+    """
+    grid = figure.subplots(-(-count // columns), columns, squeeze=False, **share).ravel()
     for axes in grid[count:]:
         axes.remove()
     for axes in grid[max(count - columns, 0) : count]:

@@ -188,10 +188,10 @@ def _draw_way(figure: Figure, motion: Motion, bottom: float) -> None:
         axes.plot(*smooth.T, color=ACCENT, linewidth=1.4, alpha=0.7, zorder=4)
         axes.plot(*way[motion.poses].T, "o", color="white", markeredgecolor=ACCENT,
                   markeredgewidth=1.6, markersize=5, zorder=5)  # fmt: skip
-        if target is not None:
+        if target is not None and (near or view is plan):
             away = float(np.linalg.norm(target - path[-1]))
-            if near or view is plan:
-                _draw_target(axes, motion.target_name, view[:2] @ target, way[-1], away, near, unit)
+            words = motion.target_name + ("" if near else f", {away:.2g} m on")
+            _draw_target(axes, words, view[:2] @ target, way[-1], near, unit)
         both.append(axes)
     above, beside = both
     if boxes[0][0] == boxes[1][0]:  # above each other
@@ -294,26 +294,19 @@ def _draw_current(axes: Axes, current: np.ndarray, plan: np.ndarray, unit: float
 
 
 def _draw_target(
-    axes: Axes,
-    name: str,
-    target: np.ndarray,
-    here: np.ndarray,
-    away: float,
-    near: bool,
-    unit: float,
+    axes: Axes, words: str, target: np.ndarray, here: np.ndarray, near: bool, unit: float
 ) -> None:
     """A mark on the target; where it is out of the picture, an arrow from `here` towards it."""
     if near:
         axes.plot(*target, "o", color="none", markersize=15, markeredgecolor=TARGET,
                   markeredgewidth=2, zorder=6)  # fmt: skip
         axes.plot(*target, "o", color=TARGET, markersize=5, zorder=6)
-        _write(axes, name, target + unit * np.array([0, 0.22]), color=TARGET, fontsize=11)
+        _write(axes, words, target + unit * np.array([0, 0.22]), color=TARGET, fontsize=11)
         return
     ahead = unit * (target - here) / max(float(np.linalg.norm(target - here)), 1e-9)
     low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
     end = np.clip(here + 1.2 * ahead, low + 0.1 * unit, high - 0.1 * unit)
     _arrow(axes, end - 0.6 * ahead, end, TARGET)
-    words = f"{name}, {away:.2g} m on"
     _write(axes, words, end + unit * np.array([0, 0.2]), color=TARGET, fontsize=11, ha="right")
 
 

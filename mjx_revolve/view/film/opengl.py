@@ -13,12 +13,8 @@ import sys
 
 from mjx_revolve.inputs.errors import InputError
 
-# Code that makes a context, by its name in MUJOCO_GL, in the order of trying.
-_WAYS = {
-    "linux": ("egl", "osmesa", "glfw"),
-    "darwin": ("cgl", "glfw"),
-    "win32": ("glfw",),
-}
+# Code that makes a context, by its name in MUJOCO_GL, in the order of trying; elsewhere glfw.
+_WAYS = {"linux": ("egl", "osmesa", "glfw"), "darwin": ("cgl", "glfw")}
 _PROBE = """
 import importlib, sys
 import mujoco

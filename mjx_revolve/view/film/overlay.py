@@ -6,8 +6,8 @@ Motes and marks make motion visible; the words are title, time, speed, depth and
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import lru_cache
+from collections.abc import Callable, Iterator
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +34,8 @@ _WHITE, _SHADE, _SOFT = (255, 255, 255, 245), (4, 28, 44, 150), (226, 240, 246, 
 AIM, FLOW = ((*(round(255 * x) for x in color), 255) for color in (TARGET, CURRENT))
 
 Overlay = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
-_Dots = Callable[[np.ndarray, np.ndarray, int], None]
-_Words = Callable[["Pen", int], None]
+_Dots = tuple[np.ndarray, np.ndarray, np.ndarray, RGB]
+"""Places `[n, 3]` [m], opacities `[n]`, radii `[n]` [m] and the colour of soft dots."""
 
 
 def make_overlay(film: Film) -> Overlay:
@@ -48,18 +48,19 @@ def make_overlay(film: Film) -> Overlay:
         A function of a picture `[height, width, 3]` uint8, its depths along the view `[height,
         width]` [m] and the frame's number, which returns a new picture.
     """
-    layers: list[_Dots] = [] if film.shots.above else [_make_motes(film)]
+    layers = [] if film.shots.above else [_make_motes(film)]
     if isinstance(film.notes, EpisodeNotes):
-        layers.append(_make_trail(film, film.notes))
+        layers.append(partial(_trail, film, film.notes))
         words = _make_episode_words(film, film.notes)
     else:
-        layers.append(_make_rings(film, film.notes))
-        words = _make_colony_words(film, film.notes)
+        layers.append(partial(_rings, film, film.notes))
+        words = partial(_write_colony, film, film.notes)
 
     def overlay(picture: np.ndarray, depth: np.ndarray, frame: int) -> np.ndarray:
         picture = np.array(picture)
         for layer in layers:
-            layer(picture, depth, frame)
+            for dots in layer(frame):
+                _add_dots(picture, depth, film, frame, dots)
         pen = Pen(picture)
         words(pen, frame)
         return np.asarray(pen.image)
@@ -70,7 +71,7 @@ def make_overlay(film: Film) -> Overlay:
 # --- dots -----------------------------------------------------------------------------------------
 
 
-def _make_motes(film: Film) -> _Dots:
+def _make_motes(film: Film) -> Callable[[int], Iterator[_Dots]]:
     """Motes that go with the water around the middle of what is shown, waves apart."""
     random = np.random.default_rng(3)
     edge = _CUBE * film.shots.distance
@@ -79,7 +80,7 @@ def _make_motes(film: Film) -> _Dots:
     drift = water_drift(film.world, film.water, film.center, 1 / film.fps)
     size = 0.0032 * film.shots.distance * (0.5 + weight)
 
-    def draw(picture: np.ndarray, depth: np.ndarray, frame: int) -> None:
+    def motes_in(frame: int) -> Iterator[_Dots]:
         camera = film.shots.position[frame]
         corner = camera - edge / 2
         motes = corner + (place + drift[frame] - corner) % edge
@@ -88,67 +89,50 @@ def _make_motes(film: Film) -> _Dots:
         # Not in the lens, and none that stands in the air.
         surface = np.asarray(film.water.surface_height)[frame]
         alpha *= np.clip(8.0 * off - 1.2, 0.0, 1.0) * (motes[:, 2] < surface - 0.02)
-        _add_dots(picture, depth, film, frame, motes, alpha, size, DUST)
+        yield motes, alpha, size, DUST
 
-    return draw
+    return motes_in
 
 
-def _make_trail(film: Film, notes: EpisodeNotes) -> _Dots:
+def _trail(film: Film, notes: EpisodeNotes, frame: int) -> Iterator[_Dots]:
     """Marks along the way, that fade."""
     places = np.arange(0, len(film.time), max(1, round(_MARK * film.fps)))
-
-    def draw(picture: np.ndarray, depth: np.ndarray, frame: int) -> None:
-        age = (frame - places) / film.fps
-        recent = (age > 0) & (age < _TRAIL)
-        marks, age = notes.way[places[recent]], age[recent]
-        # They come up behind the robot rather than inside it.
-        away = np.linalg.norm(marks - film.center[frame], axis=1)
-        alpha = 0.85 * (1.0 - age / _TRAIL)
-        alpha *= np.clip(4.0 * away / notes.radius[frame] - 2.0, 0.0, 1.0)
-        size = np.full(len(marks), 0.0065 * film.shots.distance)
-        _add_dots(picture, depth, film, frame, marks, alpha, size, ACCENT)
-
-    return draw
+    age = (frame - places) / film.fps
+    recent = (age > 0) & (age < _TRAIL)
+    marks, age = notes.way[places[recent]], age[recent]
+    # They come up behind the robot rather than inside it.
+    away = np.linalg.norm(marks - film.center[frame], axis=1)
+    alpha = 0.85 * (1.0 - age / _TRAIL)
+    alpha *= np.clip(4.0 * away / notes.radius[frame] - 2.0, 0.0, 1.0)
+    yield marks, alpha, np.full(len(marks), 0.0065 * film.shots.distance), ACCENT
 
 
-def _make_rings(film: Film, notes: ColonyNotes) -> _Dots:
+def _rings(film: Film, notes: ColonyNotes, frame: int) -> Iterator[_Dots]:
     """Level rings of dots: around places, and around robots that are born or die."""
     distance = film.shots.distance
 
-    def draw(picture: np.ndarray, depth: np.ndarray, frame: int) -> None:
-        def ring(middle: np.ndarray | RGB, radius: float, alpha: float, color: RGB) -> None:
-            count = max(12, round(2 * math.pi * radius / (_SPACE * distance)))
-            angle = 2 * np.pi * np.arange(count) / count
-            points = middle + radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
-            faint, size = np.full(count, alpha), np.full(count, _DOT * distance)
-            _add_dots(picture, depth, film, frame, points, faint, size, color)
+    def ring(middle: np.ndarray | RGB, radius: float, alpha: float, color: RGB) -> _Dots:
+        count = max(12, round(2 * math.pi * radius / (_SPACE * distance)))
+        angle = 2 * np.pi * np.arange(count) / count
+        points = middle + radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
+        return points, np.full(count, alpha), np.full(count, _DOT * distance), color
 
-        for mark in notes.marks:
-            ring(mark.place, mark.radius, 0.5, PLACE)
-        for (times, index), color, grows in ((notes.births, BIRTH, 1), (notes.deaths, DEATH, 0)):
-            for time, k in zip(times, index, strict=True):
-                age, one = (film.time[frame] - time) / _RING, film.robots[k]
-                if 0 <= age < 1:
-                    radius = one.robot.morphology.length * (0.6 + 1.4 * abs(1 - grows - age))
-                    ring(one.qpos[frame, :3], radius, 0.95 * math.sqrt(1 - age), color)
-
-    return draw
+    for mark in notes.marks:
+        yield ring(mark.place, mark.radius, 0.5, PLACE)
+    for (times, index), color, grows in ((notes.births, BIRTH, 1), (notes.deaths, DEATH, 0)):
+        for time, k in zip(times, index, strict=True):
+            age, one = (film.time[frame] - time) / _RING, film.robots[k]
+            if 0 <= age < 1:
+                radius = one.robot.morphology.length * (0.6 + 1.4 * abs(1 - grows - age))
+                yield ring(one.qpos[frame, :3], radius, 0.95 * math.sqrt(1 - age), color)
 
 
-def _add_dots(
-    picture: np.ndarray,
-    depth: np.ndarray,
-    film: Film,
-    frame: int,
-    points: np.ndarray,
-    alpha: np.ndarray,
-    size: np.ndarray,
-    color: RGB,
-) -> None:
-    """Lays soft dots of radii `size` [m] at points `[n, 3]` [m] over a picture, in place.
+def _add_dots(picture: np.ndarray, depth: np.ndarray, film: Film, frame: int, dots: _Dots) -> None:
+    """Lays soft dots over a picture, in place.
 
     Not where something stands before them, by the depths of the picture [m].
     """
+    points, alpha, size, color = dots
     height, width = depth.shape
     flat, away = film.shots.project(frame, points)
     x, y = width / 2 + flat[:, 0] * height / 2 - 0.5, height / 2 - flat[:, 1] * height / 2 - 0.5
@@ -221,16 +205,11 @@ class Pen:
         self.draw.polygon([tuple(point) for point in wings], fill=color)
 
 
-def _make_colony_words(film: Film, notes: ColonyNotes) -> _Words:
+def _write_colony(film: Film, notes: ColonyNotes, pen: Pen, frame: int) -> None:
     """Title, time, and how many robots are alive, were born and have died."""
-
-    def words(pen: Pen, frame: int) -> None:
-        pen.title(film.title)
-        now = film.time[frame]
-        pen.write(pen.edge, pen.base - pen.line, f"{now:.1f} s", "ls", _WHITE, bold=True)
-        pen.write(pen.edge, pen.base, count_words(film, notes, frame), "ls")
-
-    return words
+    pen.title(film.title)
+    pen.write(pen.edge, pen.base - pen.line, f"{film.time[frame]:.1f} s", "ls", _WHITE, bold=True)
+    pen.write(pen.edge, pen.base, count_words(film, notes, frame), "ls")
 
 
 def count_words(film: Film, notes: ColonyNotes, frame: int) -> str:
@@ -243,7 +222,7 @@ def count_words(film: Film, notes: ColonyNotes, frame: int) -> str:
     return "   ".join(f"{n} {one if n == 1 else many}" for n, one, many in counts)
 
 
-def _make_episode_words(film: Film, notes: EpisodeNotes) -> _Words:
+def _make_episode_words(film: Film, notes: EpisodeNotes) -> Callable[[Pen, int], None]:
     """Title, score, time, speed, depth, scale; the current and the target."""
     shots, below, flows = film.shots, _bed_words(film), is_moving(notes.current)
 

@@ -141,7 +141,7 @@ def make_report(
         ]
     content += [
         ("bodies", "Bodies", _bodies(numbered)),
-        ("runs", "Runs", _runs(plans, outcomes, named, folder, at)),
+        ("runs", "Runs", _runs(plans, outcomes, named, folder.resolve() == at.resolve())),
         ("repeat", "Repeat it", sections.sweep_repeat(_command(sweep, folder), settings)),
     ]
     lead = sections.headline([
@@ -259,15 +259,10 @@ def _bodies(numbered: Numbered) -> str:
 
 
 def _runs(
-    plans: Sequence[Plan],
-    outcomes: Sequence[Outcome],
-    cases: Mapping[str, str],
-    folder: Path,
-    at: Path,
+    plans: Sequence[Plan], outcomes: Sequence[Outcome], cases: Mapping[str, str], near: bool
 ) -> str:
-    """A line for each run, with links to its folder where these can be relative."""
+    """A line for each run; with links to its folder where the page is near: beside these."""
     found = {o.plan: o for o in outcomes}
-    near = folder.resolve() == at.resolve()
     rows: list[list[str | int]] = []
     for plan in plans:
         outcome, link = found.get(plan), plan.folder.name
