@@ -313,12 +313,11 @@ class Live extends Page {
   show() {
     const { stage, world, size, clock, data } = this, there = [...this.robots.there.values()];
     const slow = !this.paused && this.newest !== null && this.speed > 0 && this.speed < 0.85 * this.rate;
-    const pace = this.paused ? "paused" : this.newest === null ? "–" : `${this.speed.toFixed(2)}×`;
+    const text = this.paused ? "paused" : this.newest === null ? "–" : `${this.speed.toFixed(2)}×`;
+    const more = slow ? "as fast as this machine can" : "";
     this.tell({
       time: { text: clock === null ? "–" : `${clock.toFixed(1)} s`, title: "in the water" },
-      pace: {
-        text: pace, more: slow ? "as fast as this machine can" : "", title: "seconds in the water for each real one",
-      },
+      pace: { text, more, title: "seconds in the water for each real one" },
       robots: `${this.cast.length} of ${data.room}`,
     });
     if (performance.now() > this.written + 250) {

@@ -203,9 +203,7 @@ class Replay extends Page {
       ArrowRight: ({ shiftKey }) => nudge(1, shiftKey),
       Home: () => this.seek(begin),
       End: () => this.seek(last),
-      ...(episode
-        ? { "[": () => this.parts.stretch(1 / 1.25), "]": () => this.parts.stretch(1.25) }
-        : {}),
+      ...(episode && { "[": () => this.parts.stretch(1 / 1.25), "]": () => this.parts.stretch(1.25) }),
     }, rates);
     const scrub = byId("scrub");
     Object.assign(scrub, { min: begin, max: last, step: Math.min(0.005, this.length / 1000) || 1 });

@@ -331,8 +331,7 @@ void main() {
   }
   // From below: the sky inside Snell's window, beyond it a mirror of the deep.
   vec3 out_ = refract(d, -n, 1.333);
-  vec3 mirrored = waterBody(reflect(d, -n)) * 0.9;
-  vec3 c = mirrored;
+  vec3 mirrored = waterBody(reflect(d, -n)) * 0.9, c = mirrored;
   if (dot(out_, out_) > 0.0) {
     float cosine = max(dot(out_, n), 0.0);
     float mirror = 0.02 + 0.98 * pow(1.0 - cosine, 5.0);

@@ -145,10 +145,8 @@ function openStage(world, size) {
   // A 2D canvas as sharp as the screen.
   function pen(id) {
     const canvas = byId(id), ratio = devicePixelRatio || 1, { clientWidth: w, clientHeight: h } = canvas;
-    if (canvas.width !== Math.round(w * ratio) || canvas.height !== Math.round(h * ratio)) {
-      canvas.width = Math.round(w * ratio);
-      canvas.height = Math.round(h * ratio);
-    }
+    const [width, height] = [w, h].map((x) => Math.round(x * ratio));
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     const context = canvas.getContext("2d");
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, w, h);

@@ -265,9 +265,8 @@ function makeTarget(size) {
 // --------------------------------------------------------------------- the robot's shadow
 
 function makeShadow(size) {
-  const target = new THREE.WebGLRenderTarget(1024, 1024, {
-    minFilter: THREE.NearestFilter, magFilter: THREE.NearestFilter,
-  });
+  const nearest = { minFilter: THREE.NearestFilter, magFilter: THREE.NearestFilter };
+  const target = new THREE.WebGLRenderTarget(1024, 1024, nearest);
   const camera = new THREE.OrthographicCamera(-1, 1, 1, -1, 0, 1);
   camera.layers.set(1);
   shared.uShadow.value = target.texture;
