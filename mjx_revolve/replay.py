@@ -128,10 +128,9 @@ def _named_paths(out: str, kinds: Sequence[str], name: str) -> dict[str, Path]:
     # A new folder may have a dot in its name (v0.2), but x.avi is a slip.
     slip = re.fullmatch(r"\.[a-z][a-z0-9]{1,4}", kind) and not out.endswith("/")
     if not path.is_dir() and (path.exists() or slip):
-        raise InputError(
-            f"--out {out}: expected a folder, or a name that ends in {', '.join(_KINDS)}; "
-            f"found {'another file' if path.exists() else repr(path.suffix)}"
-        )
+        found = "another file" if path.exists() else repr(path.suffix)
+        wanted = f"a folder, or a name that ends in {', '.join(_KINDS)}"
+        raise InputError(f"--out {out}", wanted, found)
     return _paths_in(path, name, kinds)
 
 

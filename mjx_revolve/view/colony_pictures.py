@@ -91,19 +91,15 @@ def plot_population(history: ColonyHistory, room: int | None = None, title: str 
                     label=f"room for {room}")  # fmt: skip
     top.set(ylabel="robots", ylim=(0, 1.08 * max([*living, room or 1])))
     top.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=6))
-    edges = _bins(history.end)
+    # Edges of round, equal bins [s].
+    bins = MaxNLocator(nbins=_BINS, steps=[1, 2, 3, 6, 10])
+    edges = np.asarray(bins.tick_values(0.0, max(history.end, 1.0)))
     _draw_turnover(low, history, edges, scale)
     low.set(xlabel=words, ylabel=f"robots in each {edges[1] - edges[0]:g} s")
     for axes in (top, low):
         legend_above(axes)
     _limit_time(top, history, scale)
     return figure
-
-
-def _bins(end: float) -> np.ndarray:
-    """Edges of round, equal bins from 0 to `end` [s]."""
-    bins = MaxNLocator(nbins=_BINS, steps=[1, 2, 3, 6, 10])
-    return np.asarray(bins.tick_values(0.0, max(end, 1.0)))
 
 
 def _draw_turnover(axes: Axes, history: ColonyHistory, edges: np.ndarray, scale: float) -> None:

@@ -92,7 +92,6 @@ def curve_with_band(
     high: np.ndarray,
     color: str,
     *,
-    label: str | None = None,
     band: str | None = None,
     **style: Any,
 ) -> None:
@@ -105,13 +104,12 @@ def curve_with_band(
         low: lower edge of the band.
         high: upper edge.
         color: of both.
-        label: of the curve in the legend.
         band: of the band in the legend.
-        **style: of the curve.
+        **style: of the curve, and its `label` in the legend.
     """
     axes.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0, label=band)
     if middle is not None:
-        axes.plot(x, middle, color=color, label=label, **{"linewidth": 1.6} | style)
+        axes.plot(x, middle, color=color, **{"linewidth": 1.6} | style)
 
 
 def limit_to_most(axes: Axes, low: Sequence[np.ndarray], high: Sequence[np.ndarray]) -> None:

@@ -58,9 +58,8 @@ def finite_rows(episode: Episode) -> tuple[Episode, float | None]:
     rows = jax.tree.map(np.asarray, episode.trajectory)
     count = count_finite(np.hstack([rows.qpos, rows.qvel]))
     if count == 0:
-        raise InputError(
-            f"{episode.title}: trajectory.qpos", "finite numbers in its first row", "none"
-        )
+        place = f"{episode.title}: trajectory.qpos"
+        raise InputError(place, "finite numbers in its first row", "none")
     lost = None if count == len(rows.qpos) else float(rows.time[count])
     return _first_rows(replace(episode, trajectory=rows), count), lost
 

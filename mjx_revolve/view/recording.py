@@ -50,10 +50,9 @@ class ReplayRobot:
         time, qpos = np.asarray(self.time), np.asarray(self.qpos)
         width = 7 + self.robot.num_hinges
         if time.ndim != 1 or len(time) == 0 or qpos.shape != (len(time), width):
-            raise InputError(
-                f"robot {self.name!r}: qpos: expected [T, {width}], a row for each of at least one "
-                f"time; found {[*qpos.shape]} for times {[*time.shape]}"
-            )
+            rows = f"[T, {width}], a row for each of at least one time"
+            found = f"{[*qpos.shape]} for times {[*time.shape]}"
+            raise InputError(f"robot {self.name!r}: qpos", rows, found)
         if not (np.isfinite(time).all() and np.isfinite(qpos).all()):
             raise InputError(f"robot {self.name!r}", "finite times and poses", "other numbers")
         if (np.diff(time) <= 0).any():

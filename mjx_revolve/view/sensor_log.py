@@ -98,12 +98,8 @@ def trace_sensors(
     hinges = plant.names[: plant.num_hinges]
     core = robot.morphology.modules[0].name
     traces = []
-    for sensor, a, b in zip(
-        observer.sensors,
-        _split(observer, given, order, steps),
-        _split(observer, true, order, steps),
-        strict=True,
-    ):
+    both = (_split(observer, found, order, steps) for found in (given, true))
+    for sensor, a, b in zip(observer.sensors, *both, strict=True):
         names: tuple[str, ...] = ("",)
         if sensor.where != "robot":
             names = hinges if sensor.where == "joint" else (core, *hinges)

@@ -52,10 +52,8 @@ def find_opengl() -> str:
             return way
     chosen = f" by MUJOCO_GL={wish}" if wish in ways else ""
     hint = ": apt-get install libegl1 libgl1-mesa-dri" if system == "linux" else ""
-    raise InputError(
-        f"OpenGL: expected one of {', '.join(ways)} to draw with{chosen}; found none that works "
-        f"(install one{hint})"
-    )
+    wanted = f"one of {', '.join(ways)} to draw with{chosen}"
+    raise InputError("OpenGL", wanted, f"none that works (install one{hint})")
 
 
 def _works(way: str) -> bool:

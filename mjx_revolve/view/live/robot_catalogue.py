@@ -110,10 +110,8 @@ def load_catalogue(paths: Sequence[str], world: str | None = None) -> RobotCatal
             continue
         own = _read_config(path)
         if own.controller != config.controller:
-            raise InputError(
-                f"{path}: controller: expected that of {sources[0]}, as all robots of a world have "
-                f"one kind; found another ({own.controller.type})"
-            )
+            alike = f"that of {sources[0]}, as all robots of a world have one kind"
+            raise InputError(f"{path}: controller", alike, f"another ({own.controller.type})")
         if kind == "run":
             drafts += _run_drafts(own, water, Path(path))
         elif own.bodies is None:
@@ -126,8 +124,8 @@ def load_catalogue(paths: Sequence[str], world: str | None = None) -> RobotCatal
     for name in sorted(shipped, key=lambda name: (name != _FIRST, name)):
         known = {(draft.short, draft.name) for draft in drafts}
         more = _bodies(config, water, shipped[name], "shipped")
-        alike = config.controller.sensors is not None or more[0].body.sensors is None
-        if alike and _can_swim(more[0].body, water):
+        sensed = config.controller.sensors is not None or more[0].body.sensors is None
+        if sensed and _can_swim(more[0].body, water):
             drafts += [x for x in more if (x.short, x.name) not in known]
     title = " and ".join(Path(path).stem or path for path in paths)
     # Drafts are trimmed, as far as they can be; many share a body.
@@ -171,19 +169,16 @@ def _kind(path: str) -> str:
         return "config"
     if not place.exists() and path in bodies:
         return "body"
+    wanted = "a run folder, a configuration or a morphology"
     if not place.is_file():
-        raise InputError(
-            f"{path}: expected a run folder, a configuration or a morphology; found none, and no "
-            f"shipped one of this name ({', '.join((*configs, *bodies))})"
-        )
+        names = ", ".join((*configs, *bodies))
+        raise InputError(path, wanted, f"none, and no shipped one of this name ({names})")
     data = load_yaml(place)
     if isinstance(data, dict) and "body" in data:
         return "body"
     if isinstance(data, dict) and "task" in data:
         return "config"
-    raise InputError(
-        path, "a run folder, a configuration or a morphology", "a file with neither task nor body"
-    )
+    raise InputError(path, wanted, "a file with neither task nor body")
 
 
 def _read_config(path: str) -> Config:
@@ -220,16 +215,13 @@ def _run_drafts(own: Config, water: World, folder: Path) -> list[_Draft]:
     run, drafts = RunReader(find_run(folder)), []
     if run.champion_path is not None:
         champion = run.load_champion()
-        score = champion.score
         own_unit = unit if champion.is_final else selected
-        words = "" if score is None else f": {score:.3g} {own_unit}"
+        words = "" if champion.score is None else f": {champion.score:.3g} {own_unit}"
         named = champion.load_config().morphology
         assert named is not None
         body = load_morphology(named, read_modules(own), allow_overlap=True)
-        genes = _known(champion.genes, str(champion.path))
-        drafts.append(
-            _Draft(f"champion{words}", "champion", group, _trimmed(own, body, water), genes)
-        )
+        body, genes = _trimmed(own, body, water), _known(champion.genes, str(champion.path))
+        drafts.append(_Draft(f"champion{words}", "champion", group, body, genes))
     if own.bodies is not None and (run.path / INDIVIDUALS).is_file():
         lives, _ = read_individuals(run.path)
         scored = [life for life in lives.values() if math.isfinite(life.score)]

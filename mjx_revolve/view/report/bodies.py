@@ -268,10 +268,9 @@ def write_pages(record: RunRecord, numbers: Sequence[int]) -> int:
     return len(missing)
 
 
-def viewer_command(record: RunRecord, number: int) -> str:
-    """The command line that shows an individual swim."""
-    words = ["python", "-m", "mjx_revolve.viewer", record.label, "--individual", str(number)]
-    return shlex.join(words)
+def viewer_command(record: RunRecord, *options: object) -> str:
+    """The command line that shows a run, or an individual of it, in a browser."""
+    return shlex.join(["python", "-m", "mjx_revolve.viewer", record.label, *map(str, options)])
 
 
 def inline_svg(svg: bytes) -> str:

@@ -55,10 +55,8 @@ def replay_champion(record: RunRecord, fitness: Fitness) -> ChampionReplay:
     if record.genes is None or record.config is None:
         raise InputError(record.label, "a champion and a configuration", "none")
     if len(record.genes) != fitness.num_genes:
-        raise InputError(
-            f"champion/genes.yaml: genes: expected {fitness.num_genes}, as config.yaml has it; "
-            f"found {len(record.genes)}"
-        )
+        wanted = f"{fitness.num_genes}, as config.yaml has it"
+        raise InputError("champion/genes.yaml: genes", wanted, len(record.genes))
     key = replay_key(record.config.evolution.seed)
     trajectory: Trajectory = jax.tree.map(np.asarray, fitness.replay(record.genes, key))
     score, measures = fitness.judge(trajectory, key)

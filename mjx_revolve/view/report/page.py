@@ -6,7 +6,6 @@ Words and markup are in `sections.html`, a function for each section, and `page.
 from __future__ import annotations
 
 import datetime
-import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -142,8 +141,8 @@ def default_page(folder: Path) -> Path:
         with open(path, "rb") as file:
             ours = f'content="{GENERATOR}"'.encode() in file.read(1000)
         if not ours:
-            raise InputError(f"{path}: expected no file or an earlier report; found another file "
-                             "(name it with --out to replace it)")  # fmt: skip
+            found = "another file (name it with --out to replace it)"
+            raise InputError(path, "no file or an earlier report", found)
     return path
 
 
@@ -183,16 +182,14 @@ def _colony(record: RunRecord, history: ColonyHistory) -> str:
     sources = {
         name: data_address(figure_png(figure), "image/png") for name, figure in figures.items()
     }
-    command = shlex.join(["python", "-m", "mjx_revolve.viewer", record.label, "--colony"])
+    command = viewer_command(record, "--colony")
     return sections.colony(tables.colony_table(history), sources, command)
 
 
 def _population(record: RunRecord, at: Path) -> str:
     """The bodies of a run."""
-    shown = show_population(record, at)
-    return sections.population(
-        shown, partial(anchor, record), partial(viewer_command, record), record.round
-    )
+    shown, command = show_population(record, at), partial(viewer_command, record, "--individual")
+    return sections.population(shown, partial(anchor, record), command, record.round)
 
 
 # --- what the champions do ------------------------------------------------------------------------
