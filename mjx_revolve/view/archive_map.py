@@ -7,7 +7,6 @@ axis.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,28 +22,6 @@ from mjx_revolve.view.plots import ORANGE, WIDE, color_bar, in_style, label_of, 
 _INK, _FRAME, _LINE = "#333333", "#9aa5ad", "#e3e8eb"
 # More cells than this have no outlines, which would hide their colours.
 _MOST_OUTLINES = 3000
-
-
-class _Map(NamedTuple):
-    """The content of a picture of an archive.
-
-    Attributes:
-        archive: the archive.
-        colors: of scores.
-        marked: cell that has a star, -1: none.
-        links: address of each cell's individual, or None.
-    """
-
-    archive: Archive
-    colors: ScalarMappable
-    marked: int
-    links: Sequence[str | None]
-
-    def star(self, axes: Axes, place: Sequence[float] | np.ndarray) -> None:
-        """Marks the place `[2]` of the marked cell."""
-        axes.plot(*place, "*", color=ORANGE, markeredgecolor="white", markersize=14,
-                  markeredgewidth=1.0, zorder=5, clip_on=False,
-                  url=self.links[self.marked])  # fmt: skip
 
 
 @in_style
@@ -74,17 +51,19 @@ def plot_archive(
     colors = ScalarMappable(cmap="viridis")
     if cells.size:
         colors.set_norm(Normalize(archive.scores[cells].min(), archive.scores[cells].max()))
-    addresses = [(links or {}).get(number) for number in archive.ids.tolist()]
+    urls = [(links or {}).get(number) for number in archive.ids.tolist()]
     is_map = len(archive.names) == 2
     figure = new_figure(*((7.2, 5.4) if is_map else (WIDE, 4.6)), title)
     axes = figure.add_subplot()
     axes.grid(False)
     axes.tick_params(length=3)
-    (_draw_map if is_map else _draw_parallel)(axes, _Map(archive, colors, marked, addresses))
+    place = (_draw_map if is_map else _draw_parallel)(axes, archive, colors, marked, urls)
     count = f"{cells.size} of {len(archive.ids)} cells"
     if cells.size:
         color_bar(figure, colors, label, ax=figure.axes, aspect=30, pad=0.015, shrink=0.9)
     if marked >= 0:
+        axes.plot(*place, "*", color=ORANGE, markeredgecolor="white", markersize=14,
+                  markeredgewidth=1.0, zorder=5, clip_on=False, url=urls[marked])  # fmt: skip
         name = "best" if champion is None else "champion"
         count += f" · {name}: {archive.scores[marked]:.3g}"
     axes.set_title(count)
@@ -94,9 +73,10 @@ def plot_archive(
 # --- two axes -------------------------------------------------------------------------------------
 
 
-def _draw_map(axes: Axes, shown: _Map) -> None:
-    """A polygon for each cell."""
-    archive = shown.archive
+def _draw_map(
+    axes: Axes, archive: Archive, colors: ScalarMappable, marked: int, urls: Sequence[str | None]
+) -> np.ndarray:
+    """A polygon for each cell; returns the place `[2]` of the marked one."""
     span = archive.highs - archive.lows
     if archive.shape:
         corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
@@ -104,17 +84,16 @@ def _draw_map(axes: Axes, shown: _Map) -> None:
     else:
         shares = voronoi_cells(scale_points(archive, archive.centers))
         polygons = [archive.lows + span * share for share in shares]
-    faces = shown.colors.to_rgba(np.ma.masked_invalid(archive.scores))
+    faces = colors.to_rgba(np.ma.masked_invalid(archive.scores))
     few = len(polygons) < _MOST_OUTLINES
     axes.add_collection(
         PolyCollection(polygons, facecolors=faces, edgecolors=_LINE if few else "face",
-                       linewidths=0.5 if few else 0.2, urls=shown.links)
+                       linewidths=0.5 if few else 0.2, urls=urls)
     )  # fmt: skip
     axes.axis((archive.lows[0], archive.highs[0], archive.lows[1], archive.highs[1]))
     axes.set(xlabel=label_of(archive.names[0]), ylabel=label_of(archive.names[1]))
     axes.spines[:].set(color=_FRAME, visible=True)
-    if shown.marked >= 0:
-        shown.star(axes, archive.centers[shown.marked])
+    return archive.centers[marked]
 
 
 def voronoi_cells(centers: np.ndarray) -> list[np.ndarray]:
@@ -136,16 +115,17 @@ def voronoi_cells(centers: np.ndarray) -> list[np.ndarray]:
 # --- more axes -----------------------------------------------------------------------------------
 
 
-def _draw_parallel(axes: Axes, shown: _Map) -> None:
-    """A line for each individual, the best ones on top."""
-    archive, cells = shown.archive, filled(shown.archive)
+def _draw_parallel(
+    axes: Axes, archive: Archive, colors: ScalarMappable, marked: int, urls: Sequence[str | None]
+) -> np.ndarray:
+    """A line for each individual, the best ones on top; returns the end `[2]` of the marked one."""
+    cells = filled(archive)
     cells = cells[np.argsort(archive.scores[cells])]
     heights = scale_points(archive, archive.points)
     places = np.arange(len(archive.names))
     axes.add_collection(LineCollection(
         [np.stack([places, row], axis=1) for row in heights[cells]], linewidths=1.0, alpha=0.6,
-        colors=shown.colors.to_rgba(archive.scores[cells]),
-        urls=[shown.links[cell] for cell in cells],
+        colors=colors.to_rgba(archive.scores[cells]), urls=[urls[cell] for cell in cells],
     ))  # fmt: skip
     for place, low, high in zip(places.tolist(), archive.lows, archive.highs, strict=True):
         axes.plot([place, place], [0.0, 1.0], color=_FRAME, linewidth=1.0, zorder=3)
@@ -156,6 +136,6 @@ def _draw_parallel(axes: Axes, shown: _Map) -> None:
     axes.set_xticks(places, [label_of(name).replace(" (", "\n(") for name in archive.names])
     axes.tick_params(axis="x", length=0)
     axes.spines[:].set_visible(False)
-    if shown.marked >= 0:
-        axes.plot(places, heights[shown.marked], color=ORANGE, linewidth=2.2, zorder=4)
-        shown.star(axes, (places[-1], heights[shown.marked, -1]))
+    if marked >= 0:
+        axes.plot(places, heights[marked], color=ORANGE, linewidth=2.2, zorder=4)
+    return np.array([places[-1], heights[marked, -1]])

@@ -241,8 +241,7 @@ def replay_data(
             "start": round(one.appears, 4),
             "end": None if one.end is None else round(float(one.end), 4),
             "info": {
-                key: value if isinstance(value, str) else f"{float(value):.4g}"
-                for key, value in one.info.items()
+                k: x if isinstance(x, str) else f"{float(x):.4g}" for k, x in one.info.items()
             },
         }
         for one in robots

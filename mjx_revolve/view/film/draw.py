@@ -74,14 +74,10 @@ def draw_shaded(film: Film, way: str) -> Iterator[tuple[Any, np.ndarray, int]]:
             _arrange(data, scene, film, groups, frame)
             color, depth = paint(scene)
             water = jax.tree.map(lambda x, frame=frame: np.float32(x[frame]), film.water)
+            water = water._replace(surface_height=water.surface_height - np.float32(origin[2]))
+            place = (shots.position[frame] - origin).astype(np.float32)
             # JAX works on this frame while MuJoCo draws the next.
-            shaded = shade(
-                color,
-                depth,
-                (shots.position[frame] - origin).astype(np.float32),
-                shots.axes(frame).astype(np.float32),
-                water._replace(surface_height=water.surface_height - np.float32(origin[2])),
-            )
+            shaded = shade(color, depth, place, shots.axes(frame).astype(np.float32), water)
             if waiting is not None:
                 yield waiting
             waiting = (shaded, depth, frame)

@@ -62,13 +62,8 @@ def _works(way: str) -> bool:
     environment = {**os.environ, "MUJOCO_GL": "disable"}
     environment.pop("PYOPENGL_PLATFORM", None)
     try:
-        done = subprocess.run(
-            [sys.executable, "-P", "-c", _PROBE, way],
-            env=environment,
-            capture_output=True,
-            timeout=_TIMEOUT,
-            check=False,
-        )
+        command = [sys.executable, "-P", "-c", _PROBE, way]
+        done = subprocess.run(command, env=environment, capture_output=True, timeout=_TIMEOUT)
     except (OSError, subprocess.SubprocessError):
         return False
     return done.returncode == 0
