@@ -223,7 +223,8 @@ def _replay(
                 record.note("untrusted", f"no replay: {error}")
             except InputError as error:
                 record.note("damaged", f"no replay: {error}")
-        if (best := group.best().folder) in bodies:
+        best = group.best().folder
+        if best in bodies:
             robots.append((group.name, bodies[best]))
     return replays, robots
 
@@ -335,7 +336,7 @@ def _robots(found: Sequence[tuple[str, Morphology]]) -> str:
         seen.append(morphology)
         rows, foot = tables.count_modules(morphology)
         entries.append({
-            "heading": f"{morphology.title}: {morphology.counts}{f' ({name})' * several}",
+            "heading": f"{morphology.title}: {morphology.counts}" + (f" ({name})" if several else ""),
             "rows": rows, "foot": foot, "modules": tables.list_modules(morphology),
             "descriptors": tables.list_descriptors(morphology),
         })  # fmt: skip

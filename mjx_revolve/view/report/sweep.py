@@ -261,7 +261,7 @@ def _bodies(numbered: Numbered) -> str:
 def _runs(
     plans: Sequence[Plan], outcomes: Sequence[Outcome], cases: Mapping[str, str], near: bool
 ) -> str:
-    """A line for each run; with links to its folder where the page is near: beside these."""
+    """A line for each run, with a link to its folder where the page is near: beside the cases."""
     found = {o.plan: o for o in outcomes}
     rows: list[list[str | int]] = []
     for plan in plans:
