@@ -335,8 +335,9 @@ def _robots(found: Sequence[tuple[str, Morphology]]) -> str:
             continue
         seen.append(morphology)
         rows, foot = tables.count_modules(morphology)
+        which = f" ({name})" if several else ""
         entries.append({
-            "heading": f"{morphology.title}: {morphology.counts}" + (f" ({name})" if several else ""),
+            "heading": f"{morphology.title}: {morphology.counts}{which}",
             "rows": rows, "foot": foot, "modules": tables.list_modules(morphology),
             "descriptors": tables.list_descriptors(morphology),
         })  # fmt: skip
