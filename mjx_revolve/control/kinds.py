@@ -21,7 +21,7 @@ from mjx_revolve.control.readings import (
 )
 from mjx_revolve.control.table import CONTROLLERS
 from mjx_revolve.engine.plant import Plant
-from mjx_revolve.inputs.errors import InputError, show
+from mjx_revolve.inputs.errors import InputError, reading, show
 from mjx_revolve.inputs.user_code import (
     call_user_function,
     function_place,
@@ -93,10 +93,8 @@ def _make_brain(plant: Plant, settings: Any, source: str, body: Morphology | Non
         for name in CONTROLLERS["brain"].settings:
             usual, found = type(settings).model_fields[name].default, getattr(settings, name)
             if found != usual:
-                raise InputError(
-                    f"{source}: controller.{name}: expected {usual:g}, as the brain of {file} is a "
-                    f"network of neurons, which has none; found {found:g}"
-                )
+                none = f"as the brain of {file} is a network of neurons, which has none"
+                raise InputError(f"{source}: controller.{name}", f"{usual:g}, {none}", f"{found:g}")
         return make_neural_network(plant, body, file)
     kind = brain.get("type") if isinstance(brain, Mapping) else brain
     if kind == "rlpower-splines":
@@ -116,22 +114,17 @@ def _check_users_controller(name: str, controller: object, plant: Plant) -> None
     count = controller.num_genes
     if not isinstance(count, int) or count < 0:
         raise InputError(f"{place}: num_genes", "a whole number >= 0", repr(count))
-    if len(controller.gene_names) != count:
-        raise InputError(
-            f"{place}: gene_names: expected {count} of them, as num_genes says; found "
-            f"{len(controller.gene_names)}"
-        )
+    named = len(controller.gene_names)
+    if named != count:
+        raise InputError(f"{place}: gene_names", f"{count} of them, as num_genes says", named)
     for signal in controller.signals:
         if signal not in OPTIONAL_SIGNALS and not is_module_signal(signal):
-            raise InputError(
-                f"{place}: signals: expected any of {', '.join(OPTIONAL_SIGNALS)}, or modules such "
-                f"as 'at ID' and 'each TYPE'; found {signal!r}"
-            )
+            known = f"any of {', '.join(OPTIONAL_SIGNALS)}"
+            known += ", or modules such as 'at ID' and 'each TYPE'"
+            raise InputError(f"{place}: signals", known, repr(signal))
     lanes, rows = 3, plant.num_rows
-    try:
+    with reading(f"{place}: signals"):
         readings = jax.eval_shape(lambda: readings_at_rest(plant, lanes, controller.signals))
-    except InputError as error:
-        raise InputError(f"{place}: signals: {error}") from None
 
     def run(genes: jax.Array, time: jax.Array, sense: SensorReadings) -> Any:
         parameters = controller.decode(genes, plant)
@@ -144,15 +137,11 @@ def _check_users_controller(name: str, controller: object, plant: Plant) -> None
         name, expected, jax.eval_shape, run, genes, time, readings
     )
     if getattr(targets, "shape", None) != (rows, lanes):
-        raise InputError(
-            f"{place}: step: expected targets [n, lanes], here [{rows}, {lanes}]; found "
-            f"{list(targets.shape) if hasattr(targets, 'shape') else type(targets).__name__}"
-        )
+        found = list(targets.shape) if hasattr(targets, "shape") else type(targets).__name__
+        raise InputError(f"{place}: step", f"targets [n, lanes], here [{rows}, {lanes}]", found)
     if _shapes(before) != _shapes(after):
-        raise InputError(
-            f"{place}: step: expected a state of the shapes that init gives, {_shapes(before)}; "
-            f"found {_shapes(after)}"
-        )
+        alike = f"a state of the shapes that init gives, {_shapes(before)}"
+        raise InputError(f"{place}: step", alike, _shapes(after))
 
 
 def _shapes(state: object) -> str:

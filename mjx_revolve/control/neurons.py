@@ -367,9 +367,7 @@ def _find_outputs(
             continue
         name = neuron.part_id
         if name not in plant.names:
-            raise InputError(
-                f"{place}.neurons.{neuron.id}.part_id: expected the id of a hinge or a thruster; "
-                f"found {show(neuron.part_id)}"
-            )
+            where = f"{place}.neurons.{neuron.id}.part_id"
+            raise InputError(where, "the id of a hinge or a thruster", show(name))
         driven.setdefault(plant.names.index(name), row_of[neuron.id])
     return [driven.get(int(k)) for k in np.asarray(plant.source)[:, 0]]

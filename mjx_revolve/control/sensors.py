@@ -23,7 +23,7 @@ from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.sensors import Sensor, check_names
 from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.plant import Plant
-from mjx_revolve.inputs.errors import InputError, show
+from mjx_revolve.inputs.errors import InputError, reading, show
 from mjx_revolve.inputs.schema import ConstraintError
 from mjx_revolve.numerics.spatial import Scalar, sincos
 from mjx_revolve.numerics.xla import materialize
@@ -76,10 +76,8 @@ class Observer:
         for k, sensor in enumerate(self.sensors):
             if self._kept(sensor) > _MAX_KEPT:
                 rate = self._rate(sensor)
-                raise InputError(
-                    f"sensors.{k}.delay: expected at most {_MAX_KEPT / rate:g} s at {rate:g} Hz; "
-                    f"found {sensor.delay:g}"
-                )
+                most = f"at most {_MAX_KEPT / rate:g} s at {rate:g} Hz"
+                raise InputError(f"sensors.{k}.delay", most, f"{sensor.delay:g}")
 
     @cached_property
     def robot_names(self) -> tuple[str, ...]:
@@ -222,15 +220,11 @@ def make_observer(
     found = Observer(DEFAULT_SENSORS if sensors is None else tuple(sensors), timestep)
     for k, sensor in enumerate(found.sensors):
         if plant is not None and sensor.at is not None:
-            try:
+            with reading(f"sensors.{k}.at"):
                 sites = plant.site(sensor.place)
-            except InputError as error:
-                raise InputError(f"sensors.{k}.at: {error}") from None
             if sensor.kind.where == "joint" and sites.hinge is None:
-                raise InputError(
-                    f"sensors.{k}.at: expected a module with a hinge, as {sensor.type} is "
-                    f"measured at one; found {show(sensor.at)}"
-                )
+                hinged = f"a module with a hinge, as {sensor.type} is measured at one"
+                raise InputError(f"sensors.{k}.at", hinged, show(sensor.at))
     return found
 
 
@@ -247,18 +241,14 @@ def resolve_sensors(
     Raises:
         InputError: a type is unknown, or two sensors have one name.
     """
-    found = []
+    found, kinds = [], {kind.name: kind for kind in modules.values()}
     for k, sensor in enumerate(DEFAULT_SENSORS if declared is None else declared):
-        if sensor.each is not None and sensor.each not in modules:
-            known = ", ".join(dict.fromkeys(kind.name for kind in modules.values()))
-            raise InputError(
-                f"{source}: sensors.{k}.each: expected a type of modules, one of {known}; found "
-                f"{show(sensor.each)}"
-            )
-        found.append(
-            sensor if sensor.each is None else replace(sensor, each=modules[sensor.each].name)
-        )
-    kinds = {kind.name: kind for kind in modules.values()}
+        if sensor.each is not None:
+            if sensor.each not in modules:
+                known = f"a type of modules, one of {', '.join(kinds)}"
+                raise InputError(f"{source}: sensors.{k}.each", known, show(sensor.each))
+            sensor = replace(sensor, each=modules[sensor.each].name)
+        found.append(sensor)
     more = [replace(s, each=name) for name, kind in kinds.items() for s in kind.sensors]
     if declared is None and not more:
         return None

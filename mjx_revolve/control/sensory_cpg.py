@@ -68,12 +68,10 @@ def make_sensory_cpg(
     made_for = as_plant(body)
     observer = make_observer(sensors, made_for.timestep, made_for)
     robot, joint = observer.robot_names, observer.joint_names
-    own = [*robot, *(f"joint {x}" for x in joint)]
+    own, few = [*robot, *(f"joint {x}" for x in joint)], len(robot)
     # P, R and O: how the observation acts on phase, amplitude and offset.
     on_phase, on_size = ([f"{what} {x}" for x in own] for what in ("phase", "amplitude"))
-    on_offset, on_bend = (
-        [f"offset {x}" for x in xs] for xs in (own[: len(robot)], own[len(robot) :])
-    )
+    on_offset, on_bend = ([f"offset {x}" for x in some] for some in (own[:few], own[few:]))
     blocks = GeneBlocks(
         made_for,
         *((what, "hinge") for what in ("amplitude", *on_phase, *on_size, *on_bend)),
@@ -81,7 +79,7 @@ def make_sensory_cpg(
         ("frequency", "robot"),
         *((what, "actuator") for what in ("offset", *on_offset)),
     )
-    few = len(robot)
+
     # Integration steps of the phases between two commands; one without a rate (older versions).
     count = 1 if made_for.rate is None else math.ceil(made_for.timestep / _PHASE_STEP - 1e-6)
     dt = made_for.timestep / count

@@ -217,10 +217,8 @@ def check_episode_path(path: str | Path) -> None:
     shipped = list_shipped("morphologies")
     check_no_sweep(path)
     if not Path(path).exists() and str(path) not in shipped:
-        raise InputError(
-            f"{path}: expected a run folder, a genes.yaml or a morphology; found none, and no "
-            f"shipped morphology of this name ({', '.join(shipped)})"
-        )
+        none = f"none, and no shipped morphology of this name ({', '.join(shipped)})"
+        raise InputError(path, "a run folder, a genes.yaml or a morphology", none)
 
 
 def check_place(path: str | Path, label: str) -> None:

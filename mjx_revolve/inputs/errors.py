@@ -69,13 +69,13 @@ class InputError(ValueError):
 class ConstraintError(ValueError):
     """Values that do not fit together, raised by a validator or a `__post_init__`."""
 
-    def __init__(self, place: str, expected: str, found: str) -> None:
+    def __init__(self, place: str, expected: str, found: object) -> None:
         """Takes the parts of a message.
 
         Args:
             place: relative to the validator, such as a field's name; "" for itself.
             expected: in words.
-            found: as the message shows it.
+            found: in words, or a value as it is shown.
         """
         super().__init__(f"{place}: expected {expected}; found {found}")
         self.place, self.expected, self.found = place, expected, found

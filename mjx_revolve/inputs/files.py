@@ -70,9 +70,8 @@ def check_name(path: str | Path, endings: Sequence[str], label: str | None = Non
     if path.is_dir():
         raise InputError(label or path, "a file", "a folder")
     if path.suffix.lower() not in endings:
-        raise InputError(
-            label or path, f"a name that ends in {' or '.join(endings)}", repr(path.suffix)
-        )
+        named = f"a name that ends in {' or '.join(endings)}"
+        raise InputError(label or path, named, repr(path.suffix))
     return path
 
 

@@ -78,9 +78,8 @@ def read_axes(settings: Sequence[str]) -> list[GridAxis]:
         if not equals:
             read_overrides([setting])  # which raises the error
         if key in axes:
-            raise InputError(
-                f"--set {key}", "each setting once, with commas between its values", "it twice"
-            )
+            once = "each setting once, with commas between its values"
+            raise InputError(f"--set {key}", once, "it twice")
         texts = split_values(text, f"--set {key}")
         values: list[Any] = []
         for one in texts:
@@ -110,18 +109,17 @@ def combine(axes: Sequence[GridAxis], otherwise: str) -> dict[str, tuple[str, ..
     count = math.prod(len(axis.texts) for axis in axes)
     if count > _MAX_CASES:
         raise InputError("--set", f"at most {_MAX_CASES} combinations", count)
-    several = [axis for axis in axes if len(axis.texts) > 1]
-    leaves = [axis.key.rpartition(".")[2] for axis in several]
+    several = [axis.key for axis in axes if len(axis.texts) > 1]
+    leaves = [key.rpartition(".")[2] for key in several]
     words = [
-        axis.key if leaves.count(leaf) > 1 else leaf
-        for axis, leaf in zip(several, leaves, strict=True)
+        key if leaves.count(leaf) > 1 else leaf for key, leaf in zip(several, leaves, strict=True)
     ]
     cases: dict[str, tuple[str, ...]] = {}
     for texts in itertools.product(*(axis.texts for axis in axes)):
-        settings = tuple(f"{axis.key}={text}" for axis, text in zip(axes, texts, strict=True))
-        differing = [text for axis, text in zip(axes, texts, strict=True) if len(axis.texts) > 1]
-        name = "+".join(f"{a}={_short(b)}" for a, b in zip(words, differing, strict=True))
-        name = _plain(name or otherwise)
+        values = {axis.key: text for axis, text in zip(axes, texts, strict=True)}
+        settings = tuple(f"{key}={text}" for key, text in values.items())
+        named = zip(words, several, strict=True)
+        name = _plain("+".join(f"{a}={_short(values[b])}" for a, b in named) or otherwise)
         if len(name) > _MAX_NAME or name.casefold() in map(str.casefold, cases):
             digest = hashlib.sha256("\0".join(settings).encode()).hexdigest()[:8]
             name = f"{name[: _MAX_NAME - 9]}-{digest}"

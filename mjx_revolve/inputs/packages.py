@@ -28,9 +28,8 @@ def check_package(place: str, module: str) -> None:
         module: its name.
     """
     if importlib.util.find_spec(module) is None:
-        raise InputError(
-            place, f"the package {module}", f"none (pip install '{REQUIREMENTS[module]}')"
-        )
+        missing = f"none (pip install '{REQUIREMENTS[module]}')"
+        raise InputError(place, f"the package {module}", missing)
 
 
 def check_mujoco() -> None:
@@ -41,10 +40,9 @@ def check_mujoco() -> None:
     """
     found, core = installed_version("mujoco"), installed_version("mujoco-core")
     if core not in ("", found):
-        raise InputError(
-            f"mujoco: expected one version; found {found or 'none'} with a mujoco-core of "
-            f"{core} (pip uninstall mujoco mujoco-core, then install mujoco again)"
-        )
+        cure = "pip uninstall mujoco mujoco-core, then install mujoco again"
+        both = f"{found or 'none'} with a mujoco-core of {core} ({cure})"
+        raise InputError("mujoco", "one version", both)
 
 
 def installed_version(name: str) -> str:

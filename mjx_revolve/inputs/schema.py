@@ -82,9 +82,8 @@ def _unit_vector(vector: tuple[float, float, float]) -> tuple[float, float, floa
 def _within(number: float) -> float:
     """The number, if it is within the range of single precision."""
     if abs(number) > LARGEST:
-        raise ConstraintError(
-            "", f"a number between -{LARGEST:.3g} and {LARGEST:.3g}", show(number)
-        )
+        between = f"a number between -{LARGEST:.3g} and {LARGEST:.3g}"
+        raise ConstraintError("", between, show(number))
     return number
 
 

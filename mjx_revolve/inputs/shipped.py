@@ -57,7 +57,5 @@ def find_shipped(
         return shipped[path.name]
     if here.exists():
         return here
-    found = "none" if label is None else f"{str(path)!r}"
-    raise InputError(
-        label or path, f"a file, or one of {', '.join(shipped)}, which come with the package", found
-    )
+    known = f"a file, or one of {', '.join(shipped)}, which come with the package"
+    raise InputError(label or path, known, "none" if label is None else repr(str(path)))

@@ -91,14 +91,11 @@ def opening(*places: str | Path, trust: bool) -> contextlib.AbstractContextManag
         if is_shipped(real) or (kind == "data" and inside) or _is_known(kind, content):
             return
         if kind == "Python":
-            raise UntrustedError(
-                f"{path}: expected a Python file that you have used before, or --trust; found one "
-                "that is new here and would be run: read it first"
-            )
-        raise UntrustedError(
-            f"{path}: expected a file inside the run folder, one that you have used before, or "
-            "--trust; found another"
-        )
+            known = "a Python file that you have used before, or --trust"
+            new = "one that is new here and would be run: read it first"
+            raise UntrustedError(path, known, new)
+        known = "a file inside the run folder, one that you have used before, or --trust"
+        raise UntrustedError(path, known, "another")
 
     return audited_by(check)
 

@@ -94,20 +94,18 @@ def load_user_function(name: str, label: str, kind: type | tuple[type, ...] = ()
     own = parse_user_function(name)
     if own is None:
         raise InputError(label, "FILE.py:FUNCTION", repr(name))
-    module = _run_file(own.path, label)
+    module, wanted = _run_file(own.path, label), f"a function {own.function} in {own.path}"
     if not hasattr(module, own.function):
         made = [
             key
             for key, value in vars(module).items()
             if isinstance(value, types.FunctionType) and value.__module__ == module.__name__
         ]
-        raise InputError(
-            f"{label}: expected a function {own.function} in {own.path}; found "
-            f"{'only ' + ', '.join(made) if made else 'no function in it'}"
-        )
+        found = f"only {', '.join(made)}" if made else "no function in it"
+        raise InputError(label, wanted, found)
     function = getattr(module, own.function)
     if not callable(function) and not isinstance(function, kind):
-        raise InputError(label, f"a function {own.function} in {own.path}", f"{function!r:.60}")
+        raise InputError(label, wanted, f"{function!r:.60}")
     return function
 
 

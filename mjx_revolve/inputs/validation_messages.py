@@ -100,9 +100,8 @@ def join(*steps: object) -> str:
 def _look_up(data: Any, steps: list[Step], otherwise: object) -> tuple[list[Step], Any]:
     """The value at a place; the place ends early where a short form stands for the whole."""
     for i, step in enumerate(steps):
-        if (
-            isinstance(data, int | float) or getattr(data, "shape", None) == ()
-        ):  # one number for several
+        # One number for several.
+        if isinstance(data, int | float) or getattr(data, "shape", None) == ():
             return steps[:i], data
         try:
             data = data[step]

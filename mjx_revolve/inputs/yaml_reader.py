@@ -33,6 +33,10 @@ def _too_deep() -> InputError:
     return InputError(f"expected at most {_MAX_DEPTH} levels of nesting; found more")
 
 
+def _line_of(node: yaml.Node) -> str:
+    return f"line {node.start_mark.line + 1}"
+
+
 class SafeLoader(yaml.SafeLoader):
     """`yaml.SafeLoader` that reads `1e-3` as a number and refuses duplicate keys.
 
@@ -69,10 +73,8 @@ class SafeLoader(yaml.SafeLoader):
         except Exception as error:  # PyYAML's constructors do not check the text against the tag
             kind = node.tag.rpartition(":")[2]
             reason = f": {error}" if isinstance(error, ValueError) else ""
-            raise InputError(
-                f"line {node.start_mark.line + 1}: expected valid YAML; found {show(node.value)} "
-                f"as {kind}{reason}"
-            ) from None
+            found = f"{show(node.value)} as {kind}{reason}"
+            raise InputError(_line_of(node), "valid YAML", found) from None
 
 
 # YAML 1.1 floats need a dot and no sign before it; users write 1e-3 and -.5 for numbers.
@@ -89,11 +91,10 @@ def _construct_mapping(loader: SafeLoader, node: yaml.MappingNode) -> dict[Hasha
     mapping: dict[Hashable, Any] = {}
     for key_node, value_node in node.value:
         key = loader.construct_object(key_node, deep=True)
-        place = f"line {key_node.start_mark.line + 1}"
         if not isinstance(key, Hashable):
-            raise InputError(place, "a plain key", show(key))
+            raise InputError(_line_of(key_node), "a plain key", show(key))
         if key in mapping:
-            raise InputError(place, "each key once", f"{show(key)} twice")
+            raise InputError(_line_of(key_node), "each key once", f"{show(key)} twice")
         mapping[key] = loader.construct_object(value_node, deep=True)
     return mapping
 
@@ -101,8 +102,7 @@ def _construct_mapping(loader: SafeLoader, node: yaml.MappingNode) -> dict[Hasha
 def _construct_int(loader: SafeLoader, node: yaml.ScalarNode) -> int:
     value = yaml.SafeLoader.construct_yaml_int(loader, node)
     if value.bit_length() > _MAX_BITS:  # hexadecimal digits may be as many as there are
-        place = f"line {node.start_mark.line + 1}"
-        raise InputError(place, "a whole number of a few digits", "a huge integer")
+        raise InputError(_line_of(node), "a whole number of a few digits", "a huge integer")
     return value
 
 
