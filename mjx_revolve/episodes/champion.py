@@ -10,17 +10,17 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from mjx_revolve.body.catalogue import MODULES, load_modules
-from mjx_revolve.body.morphology import load_morphology, trim_neutral
+from mjx_revolve.body.morphology import trim_neutral
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.episodes.config import Config
-from mjx_revolve.episodes.early_checks import refuse_world
+from mjx_revolve.episodes.early_checks import read_episode_file, refuse_world
 from mjx_revolve.episodes.fitness import (
     Fitness,
     fit_body,
@@ -37,11 +37,8 @@ from mjx_revolve.episodes.tasks import COLONY_FITNESS, body_length, score_unit
 from mjx_revolve.inputs.commands import opening_episode
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import check_path
-from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.inputs.short_repr import short_repr
-from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.water.flow import Water
-from mjx_revolve.water.world import load_world
 
 # Duration of the episode of a morphology without a task [s].
 _SECONDS = 10.0
@@ -114,22 +111,13 @@ def load_episode(
     if individual is not None:
         refuse_world(world, modules)
         return _individual(path, individual, duration, seed)
-    if path.is_dir():
-        refuse_world(world, modules)
-        return _champion(RunReader(path).load_champion(), duration, seed)
-    path = find_shipped(path, "morphologies")
-    data = load_yaml(path)
-    if isinstance(data, dict) and "genes" in data:
-        refuse_world(world, modules)
-        return _champion(read_champion(path), duration, seed)
-    if not (isinstance(data, dict) and "body" in data):
-        raise InputError(
-            f"{path}: expected a run folder, a champion's genes.yaml or a morphology; found a file "
-            "with neither genes nor body"
-        )
-    water = load_world("lake" if world is None else world)
-    own = {} if modules is None else load_modules(modules)
-    morphology = load_morphology(path, MODULES | own)
+    named = read_episode_file(path, world, modules)
+    if named is None:
+        known = "a run folder, a champion's genes.yaml or a morphology"
+        raise InputError(path, known, "a file with neither genes nor body")
+    if isinstance(named, ChampionRecord):
+        return _champion(named, duration, seed)
+    morphology, water = named
     with suppress(InputError):  # a robot that floats stays as it is
         morphology = trim_neutral(morphology, water.density)
     robot = build_robot(morphology, water)
@@ -155,15 +143,9 @@ def load_asked(arguments: argparse.Namespace) -> Episode:
     Raises:
         InputError: as `load_episode`, or a file is not trusted (see `trust.opening`).
     """
+    named = attrgetter("path", "world", "duration", "seed", "individual", "modules")
     with opening_episode(arguments):
-        return load_episode(
-            arguments.path,
-            arguments.world,
-            arguments.duration,
-            arguments.seed,
-            arguments.individual,
-            arguments.modules,
-        )
+        return load_episode(*named(arguments))
 
 
 def _settings(duration: float | None) -> dict[str, float | None]:
@@ -240,10 +222,8 @@ def read_individuals(
     folder = find_run(path)
     config = RunReader(folder).load_config(**_settings(duration))
     if config.bodies is None:
-        raise InputError(
-            f"{folder}: expected a run in which bodies evolve, to show one of many; found one in "
-            "which only genes do"
-        )
+        many = "a run in which bodies evolve, to show one of many"
+        raise InputError(folder, many, "one in which only genes do")
     return config, find_individuals(folder, numbers)
 
 
