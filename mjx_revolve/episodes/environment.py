@@ -23,11 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
-from mjx_revolve.control.sensors import Observer, make_observer, resolve_sensors
+from mjx_revolve.control.sensors import Observer, make_observer
 from mjx_revolve.episodes.config import make_config
 from mjx_revolve.episodes.evaluation import Episodes, task_recorder
-from mjx_revolve.episodes.fitness import Fitness
-from mjx_revolve.episodes.named_files import read_modules
+from mjx_revolve.episodes.fitness import Fitness, with_sensors
 from mjx_revolve.episodes.rollout import (
     Rollout,
     RolloutState,
@@ -278,32 +277,26 @@ def make_environment(
         InputError: such a rate is not possible, a sensor is wrong, or there are no actuators or no
             sensors.
     """
-    config, body = fitness.config, fitness.robot.morphology
+    config = fitness.config
     if config.engine != "population":
-        raise InputError(
-            f"{config.source}: engine", "population, to step environments", config.engine
-        )
+        needed = "population, to step environments"
+        raise InputError(f"{config.source}: engine", needed, config.engine)
     plant = fitness.engine.plant
     if plant.num_actuators == 0:
-        raise InputError(
-            f"{config.source}: morphology", "a hinge or a thruster to act with", "none"
-        )
+        needed = "a hinge or a thruster to act with"
+        raise InputError(f"{config.source}: morphology", needed, "none")
     every = _period(control_rate, fitness.record_every, fitness.world.timestep)
-    declared = config.controller.sensors
     if sensors is not None:
         data = config.model_dump() | {"controller": {"type": "mlp", "sensors": list(sensors)}}
-        declared = make_config(data, "/", source=config.source).controller.sensors
-    elif declared is None:
-        declared = body.sensors
-    declared = resolve_sensors(declared, read_modules(config), config.source)
+        config = make_config(data, "/", source=config.source)
+    declared = with_sensors(config, fitness.robot.morphology).sensors
     observer = make_observer(declared, every * fitness.world.timestep, plant)
     hinges = plant.names[: plant.num_hinges]
     joints = [f"{name} {joint}" for joint in hinges for name in observer.joint_names]
     names = (*observer.robot_names, *joints)
     if not names:
-        raise InputError(
-            f"{config.source}: controller.sensors", "some that this robot can have", "none"
-        )
+        needed = "some that this robot can have"
+        raise InputError(f"{config.source}: controller.sensors", needed, "none")
     return Environment(fitness, observer, every, names, plant.names)
 
 

@@ -93,8 +93,7 @@ class Fitness(EpisodeSpec[tuple[()]]):
     @property
     def _bodies_key(self) -> object:
         body = self.robot.morphology
-        listening = _listening(self.config, read_modules(self.config), body)
-        return body, listening.model_dump_json()
+        return body, with_sensors(self.config, body).model_dump_json()
 
     def __call__(self, population: ArrayLike, key: jax.Array) -> jax.Array:
         """Scores a population.
@@ -135,7 +134,7 @@ class Fitness(EpisodeSpec[tuple[()]]):
         """
         rate, plant = self.controller.rate, plant_of(self.robot)
         body = self.robot.morphology
-        settings = _listening(self.config, read_modules(self.config), body)
+        settings = with_sensors(self.config, body)
         exact = [replace(s, noise=0.0, rate=None, delay=0.0) for s in settings.sensors or ()]
         sensors = None if settings.sensors is None else tuple(exact)
         settings = settings.model_copy(update={"rate": None, "sensors": sensors})
@@ -408,14 +407,9 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
         Returns:
             Their trajectories, with a row about every 0.02 s.
         """
-        population = jnp.stack(
-            [self.pad_genes(own, robot) for own, robot in zip(genes, robots, strict=True)]
-        )
-        bodies = self.pack(robots)
-        trials = jnp.full(len(population), trial, jnp.int32)
-        rows = {
-            name: np.asarray(x) for name, x in self._trace(bodies, population, key, trials).items()
-        }
+        padded = [self.pad_genes(own, robot) for own, robot in zip(genes, robots, strict=True)]
+        bodies, trials = self.pack(robots), jnp.full(len(padded), trial, jnp.int32)
+        rows = jax.tree.map(np.asarray, self._trace(bodies, jnp.stack(padded), key, trials))
         source, step = np.asarray(bodies.plant.source), self.trace_every * self.world.timestep
         varied = self.variation(key, trial)
         return [
@@ -473,11 +467,9 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
             reach = max_distance(self.settings, self.world, bodies.figure)
             k = int(np.argmax(reach))
             if may_touch_bed(self.task, self.settings, self.world, reach[k]):
-                raise InputError(
-                    f"robot {robots[k].morphology.name!r}",
-                    "a body that cannot reach the bed, as the examples cannot",
-                    "one that may (give one like it as an example)",
-                )
+                low = "a body that cannot reach the bed, as the examples cannot"
+                found = "one that may (give one like it as an example)"
+                raise InputError(f"robot {robots[k].morphology.name!r}", low, found)
         return bodies
 
 
@@ -529,10 +521,9 @@ def make_fitness(
     """
     config = _read(config, overrides)
     if config.morphology is None:
-        raise InputError(
-            f"{config.source}: morphology: expected one, as this is the fitness of one body; found "
-            "bodies that evolve (see make_mixed_fitness)"
-        )
+        one = "one, as this is the fitness of one body"
+        found = "bodies that evolve (see make_mixed_fitness)"
+        raise InputError(f"{config.source}: morphology", one, found)
     return fit_body(config, read_morphology(config))
 
 
@@ -554,7 +545,7 @@ def fit_body(config: Config, morphology: Morphology) -> Fitness:
     figure = body_geometry(robot)
     reach = max_distance(config.task, world, figure)
     engine = make_engine(robot, config.engine, may_touch_bed(task, config.task, world, reach))
-    settings = _listening(config, read_modules(config), morphology)
+    settings = with_sensors(config, morphology)
     controller = _find_controller(config, settings, engine.plant, morphology)
     return Fitness(config, world, task, controller, robot, engine, figure)
 
@@ -614,7 +605,7 @@ def make_mixed_fitness(
         touches = world.bed is not None
     shown = [*robots, *_show_kinds(kinds, robots, hinges)]
     _check_alike(config, examples)
-    controller_settings = _listening(config, read_modules(config))
+    controller_settings = with_sensors(config)
     sites = dict.fromkeys(s.each for s in controller_settings.sensors or () if s.each is not None)
     capacity = fit_capacity(shown, kinds, touches, hinges, rows, modules, tuple(sites))
     example = jax.tree.map(jnp.asarray, pack_bodies([robots[0]] * 3, capacity)).plant
@@ -680,17 +671,15 @@ def _place(config: Config) -> tuple[World, Task]:
             "bed; found none"
         )
     if task.on_bed and config.task.start_attitude != "level":
-        raise InputError(
-            f"{config.origin('task.start_attitude')}task.start_attitude: expected level, as "
-            f"{config.task.name} starts on the bed; found {config.task.start_attitude}"
-        )
+        place = f"{config.origin('task.start_attitude')}task.start_attitude"
+        level = f"level, as {config.task.name} starts on the bed"
+        raise InputError(place, level, config.task.start_attitude)
     if world.bed is not None and task.start is start_at_depth and config.colony is None:
         deepest = world.surface_height - float(bed_height(world.bed, *np.zeros((2, 1)))[0])
         if config.task.depth >= deepest:
-            raise InputError(
-                f"{config.origin('task.depth')}task.depth: expected one above the bed, which is "
-                f"{deepest:g} m below the surface; found {config.task.depth:g}"
-            )
+            place = f"{config.origin('task.depth')}task.depth"
+            least = f"one above the bed, which is {deepest:g} m below the surface"
+            raise InputError(place, least, f"{config.task.depth:g}")
     _check_robust(config, world)
     return world, task
 
@@ -699,25 +688,21 @@ def _check_robust(config: Config, world: World) -> None:
     """Refuses `task.robust` for laws with coefficients that cannot be varied."""
     if config.task.robust is None:
         return
+    place = f"{config.source}: task.robust"
     if config.engine != "population":
-        raise InputError(
-            f"{config.source}: task.robust: expected off, as engine is {config.engine}, which has "
-            "its coefficients as constants; found some ranges"
-        )
+        off = f"off, as engine is {config.engine}, which has its coefficients as constants"
+        raise InputError(place, off, "some ranges")
     if not find_drag_law(world.drag).varied:
         *most, last = (name for name, law in DRAG_LAWS.items() if law.varied)
-        raise InputError(
-            f"{config.source}: task.robust: expected a world with drag {', '.join(most)} or "
-            f"{last}, as MuJoCo's laws are not varied; found {world.drag}"
-        )
+        known = f"a world with drag {', '.join(most)} or {last}, as MuJoCo's laws are not varied"
+        raise InputError(place, known, world.drag)
 
 
 def _build(config: Config, world: World, morphology: Morphology) -> Robot:
     if config.trim == "neutral":
         if world.density == 0:
-            raise InputError(
-                f"{config.source}: trim", "none, as water of density 0 carries nothing", "neutral"
-            )
+            none = "none, as water of density 0 carries nothing"
+            raise InputError(f"{config.source}: trim", none, "neutral")
         morphology = trim_neutral(morphology, world.density)
     return build_robot(morphology, world)
 
@@ -726,23 +711,18 @@ def _check_alike(config: Config, bodies: Sequence[Morphology]) -> None:
     """Refuses bodies with sensors of their own where all must have the same."""
     for body in bodies:
         if body.sensors is not None and config.controller.sensors is None:
-            raise InputError(
-                f"{config.source}: controller.sensors: expected some, the same for all bodies; "
-                f"found none, and sensors of its own in {body.name!r}"
-            )
+            own = f"none, and sensors of its own in {body.name!r}"
+            same = "some, the same for all bodies"
+            raise InputError(f"{config.source}: controller.sensors", same, own)
 
 
-def _listening(
-    config: Config, modules: Mapping[str, ModuleType], body: Morphology | None = None
-) -> ControllerConfig:
+def with_sensors(config: Config, body: Morphology | None = None) -> ControllerConfig:
     """Settings of the controller with all its sensors, those of types of modules, too."""
-    settings = config.controller
-    declared = settings.sensors
+    declared = config.controller.sensors
     if declared is None and body is not None:
         declared = body.sensors
-    return settings.model_copy(
-        update={"sensors": resolve_sensors(declared, modules, config.source)}
-    )
+    sensors = resolve_sensors(declared, read_modules(config), config.source)
+    return config.controller.model_copy(update={"sensors": sensors})
 
 
 def _find_controller(
@@ -755,10 +735,9 @@ def _find_controller(
     if settings.depth is None:
         task = TASKS.get(config.task.type)
         if settings.type == "feedback" and task is not None and task.on_bed:
-            raise InputError(
-                f"{config.origin('controller.depth')}controller.depth: expected a depth [m], as "
-                f"{config.task.type} does not start at task.depth; found none"
-            )
+            place = f"{config.origin('controller.depth')}controller.depth"
+            depth = f"a depth [m], as {config.task.type} does not start at task.depth"
+            raise InputError(place, depth, "none")
         settings = settings.model_copy(update={"depth": config.task.depth})
     try:
         return find_controller(plant, settings, config.source, example, body)
