@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -47,17 +47,6 @@ class WaterState:
         return replace(self, **changes)
 
 
-T = TypeVar("T")
-
-
-def _to_lanes(tree: T) -> T:
-    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), tree)
-
-
-def _from_lanes(tree: T) -> T:
-    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), tree)
-
-
 def _of_one(run: Callable[..., PyTree]) -> Callable[..., PyTree]:
     """A function of lanes as a function of a single lane; `jax.vmap` maps batches to lanes."""
 
@@ -72,7 +61,8 @@ def _of_one(run: Callable[..., PyTree]) -> Callable[..., PyTree]:
             lambda x, is_batched: x if is_batched else jnp.broadcast_to(x, (size, *x.shape)),
             given, tuple(batched),
         )  # fmt: skip
-        found = _from_lanes(run(*_to_lanes(whole)))
+        lanes = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), whole)
+        found = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), run(*lanes))
         return found, jax.tree.map(lambda _: True, found)
 
     return single

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal, Self, TypeVar
 
 import numpy as np
 from annotated_types import Ge, Le
@@ -19,7 +19,7 @@ from pydantic import AllowInfNan, BaseModel, ConfigDict, ValidationError, model_
 
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology, make_morphology
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.schema import LARGEST, Number, TupleOf, read
 
 INDIVIDUALS, GENERATIONS = "individuals.jsonl", "generations.jsonl"
@@ -36,20 +36,25 @@ class _Line(BaseModel):
     model_config = ConfigDict(strict=True)
 
 
-class _Individual(_Line):
+class _Child(_Line):
+    """A line about an individual: its number, and those of its parents."""
+
     id: _Count
     parents: tuple[_Count, ...]
+
+    @model_validator(mode="after")
+    def _check_parents(self) -> Self:
+        if any(parent >= self.id for parent in self.parents):
+            raise ValueError("expected parents that are older")
+        return self
+
+
+class _Individual(_Child):
     born: _Count
     origin: str
     score: Annotated[float, AllowInfNan(False)] | None
     descriptors: dict[str, float]
     measures: dict[str, float]
-
-    @model_validator(mode="after")
-    def _check(self) -> _Individual:
-        if any(parent >= self.id for parent in self.parents):
-            raise ValueError("expected parents that are older")
-        return self
 
 
 class _Generation(_Line):
@@ -57,19 +62,16 @@ class _Generation(_Line):
     living: tuple[_Count, ...]
 
 
-class _Event(_Line):
+class _Event(_Child):
     time: _Time
     event: Literal["birth", "mating", "death"]
-    id: _Count
     place: tuple[_Coordinate, _Coordinate, _Coordinate]
     other: _Count | None = None
     cause: str = ""
     parents: tuple[_Count, ...] = ()
 
     @model_validator(mode="after")
-    def _check(self) -> _Event:
-        if any(parent >= self.id for parent in self.parents):
-            raise ValueError("expected parents that are older")
+    def _check(self) -> Self:
         needed = {"birth": "parents", "mating": "other", "death": "cause"}[self.event]
         if needed not in self.model_fields_set or getattr(self, needed) is None:
             raise ValueError(f"expected {needed}")
@@ -117,10 +119,8 @@ class LoggedIndividual:
         Raises:
             InputError: the line holds none.
         """
-        try:
+        with reading(f"individual {self.number}"):
             return make_morphology(json.loads(self.text).get("body"), modules, allow_overlap=True)
-        except InputError as error:
-            raise InputError(f"individual {self.number}: {error}") from None
 
 
 @dataclass(frozen=True, eq=False)

@@ -161,8 +161,7 @@ class Passport:
             | ({"passed": check.passed} if check.judged else {})
             for name, check in self.checks.items()
         }
-        data = {"passed": not self.failed, "checks": checks}
-        return dump_yaml(data)
+        return dump_yaml({"passed": not self.failed, "checks": checks})
 
 
 def load_passport(path: Path) -> Passport:
@@ -224,14 +223,11 @@ def _swim(fitness: Fitness, genes: jax.Array, key: jax.Array) -> Iterator[tuple[
     varied = fitness.config.engine == "population" and find_drag_law(fitness.world.drag).varied
     tried = _variants() if varied else {}
     few = _Lanes(np.arange(_FEW), np.ones(_FEW, int), None)
-    # XLA compiles without Python's lock: the three programs side by side. That of half a step is
-    # sooner swum than compiled well.
+    # XLA compiles without Python's lock: the three programs side by side.
     with ThreadPoolExecutor(3) as threads:
         coarse = threads.submit(_scores, fitness, genes, key, _all_lanes(tried), True)
-        fine = {
-            part: threads.submit(_scores, fitness, genes, key, few, False, part, part == 2)
-            for part in (2, 4)
-        }
+        given = fitness, genes, key, few, False
+        fine = {part: threads.submit(_scores, *given, part) for part in (2, 4)}
         scores = coarse.result()
         finer = {part: found.result()[usual].mean() for part, found in fine.items()}
     own = scores[usual][:_STARTS]
@@ -307,13 +303,7 @@ def _with_step(fitness: Fitness, part: int) -> Fitness:
 
 
 def _scores(
-    fitness: Fitness,
-    genes: jax.Array,
-    key: jax.Array,
-    lanes: _Lanes,
-    long: bool,
-    part: int = 1,
-    fast: bool = False,
+    fitness: Fitness, genes: jax.Array, key: jax.Array, lanes: _Lanes, long: bool, part: int = 1
 ) -> dict[float, np.ndarray]:
     """Scores of lanes after some times.
 
@@ -324,7 +314,6 @@ def _scores(
         lanes: what is tried.
         long: whether it swims longer than the task lasts.
         part: how many steps there are for one of the world's.
-        fast: whether the program is compiled in haste.
 
     Returns:
         `[lanes]` by time [s]: the task's duration first, then the longer ones.
@@ -366,7 +355,8 @@ def _scores(
 
     # Kept, the programs are there for the next champion of this body.
     made_of = jax.tree.map(np.ndarray.tolist, lanes)
-    program = fitness.keep(run, "passport", made_of, times, fast=fast)
+    # That of half a step is sooner swum than compiled well.
+    program = fitness.keep(run, "passport", made_of, times, fast=part == 2)
     found = program(genes, key)
     return {seconds: np.asarray(x, float) for seconds, x in found.items()}
 

@@ -8,8 +8,9 @@ import json
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from inspect import isclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -103,22 +104,14 @@ def map_files(
     for name, field in model.model_fields.items():
         value, place = found.get(name), f"{within}{name}"
         mark = next((mark for mark in field.metadata if isinstance(mark, File)), None)
-        section = next((kind for kind in _kinds(field.annotation) if _is_section(kind)), None)
+        kinds = field.annotation, *get_args(field.annotation)  # of a union, its members
+        section = next((x for x in kinds if isclass(x) and issubclass(x, BaseModel)), None)
         if mark is not None:
             if name in found:
                 found[name] = _map_value(mark.kind, place, value, change)
         elif section is not None and isinstance(value, Mapping):
             found[name] = map_files(value, change, section, f"{place}.")
     return found
-
-
-def _kinds(annotation: object) -> tuple[Any, ...]:
-    """A type, or the members of a union."""
-    return annotation, *getattr(annotation, "__args__", ())
-
-
-def _is_section(kind: object) -> bool:
-    return isinstance(kind, type) and issubclass(kind, BaseModel)
 
 
 def _map_value(kind: str, place: str, value: object, change: Change) -> object:
@@ -270,6 +263,5 @@ class Section(Settings):
     def refuse_params(self, params: Mapping[str, object]) -> None:
         """Raises `ConstraintError` for `params` of a type that is one of ours."""
         if params and not self.is_user_code:
-            raise ConstraintError(
-                "params", "none, as only own functions take them", ", ".join(params)
-            )
+            none = "none, as only own functions take them"
+            raise ConstraintError("params", none, ", ".join(params))

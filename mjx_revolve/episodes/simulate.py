@@ -102,10 +102,8 @@ def _compiled(
             targets = jax.vmap(simulator.plant.arrange)(drive_input[:, own, None])
         else:
             parameters = controller.decode(drive_input[:, None], simulator.plant)
-            policy, controller_state = (
-                controlled(controller, parameters),
-                controller.init(parameters),
-            )
+            policy = controlled(controller, parameters)
+            controller_state = controller.init(parameters)
         moving = None if still else water
         if moving is not None:
             moving = jax.tree.map(lambda x: jnp.broadcast_to(x, (steps,))[:, None], moving)
@@ -210,10 +208,8 @@ def simulate(
             qpos = jnp.asarray(qpos).at[3:7].set(turned)
     qpos = _array("qpos", qpos, (model.nq,))
     if not is_traced(qpos) and not np.any(qpos[3:7]):
-        raise InputError(
-            "qpos[3:7]: expected a quaternion (w, x, y, z) of any length but 0; found zeros "
-            "([1, 0, 0, 0] for the rest pose)"
-        )
+        zeros = "zeros ([1, 0, 0, 0] for the rest pose)"
+        raise InputError("qpos[3:7]", "a quaternion (w, x, y, z) of any length but 0", zeros)
     qvel = jnp.zeros(model.nv) if qvel is None else _array("qvel", qvel, (model.nv,))
     if water is None and robot.world.gust is not None:
         path = draw_gusts(robot.world, jax.random.key(0) if key is None else key, steps, 1)
@@ -237,20 +233,14 @@ def simulate(
 
 
 def _steps(rows: Any, duration: float | None, dt: float) -> int:
-    if duration is not None and (
-        isinstance(duration, bool)
-        or not isinstance(duration, int | float | np.number)
-        or not np.isfinite(duration)
-        or duration <= 0
-    ):
+    real = isinstance(duration, int | float | np.number) and not isinstance(duration, bool)
+    if duration is not None and not (real and 0 < duration < np.inf):
         raise InputError("duration", "seconds > 0", repr(duration))
     if rows is not None and rows.ndim == 2:
         steps = rows.shape[0]
         if duration is not None and abs(duration - steps * dt) > dt:
-            raise InputError(
-                f"duration: expected {steps * dt:g} s, as ctrl has {steps} rows of {dt:g} s; "
-                f"found {duration:g}"
-            )
+            same = f"{steps * dt:g} s, as ctrl has {steps} rows of {dt:g} s"
+            raise InputError("duration", same, f"{duration:g}")
         return steps
     return max(1, round((5.0 if duration is None else duration) / dt))
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -128,6 +128,7 @@ class Tank:
         self._current = np.array(self.world.current, np.float32)
         self._bodies: Any = None
         self._spheres: Any = None
+        self._programs: dict[tuple[int, int], Any] = {}
 
     @property
     def world(self) -> World:
@@ -208,10 +209,8 @@ class Tank:
             wide = self.mixed.pad_genes(np.asarray(genes, np.float32), robot)
         size = np.linalg.norm(np.asarray(quat, float))
         if not (np.all(np.isfinite(position)) and np.isfinite(size) and size > 0):
-            raise InputError(
-                f"tank: expected a finite place and a quaternion of some length; found "
-                f"{list(position)} and {list(quat)}"
-            )
+            finite = "a finite place and a quaternion of some length"
+            raise InputError("tank", finite, f"{list(position)} and {list(quat)}")
         place = free[0]
         seed = np.uint32(place if noise is None else noise)
         self._put(place, robot)
@@ -303,9 +302,9 @@ class Tank:
         stride = max(1, round(every / step))
         rows = max(1, round(duration / (stride * step)))
         alive = self.alive
+        time = (self.steps + stride * np.arange(1, rows + 1)) * step
         if self._bodies is None:  # no robot was ever added
             self.steps += rows * stride
-            time = (self.steps - stride * np.arange(rows)[::-1]) * step
             blank = np.zeros((rows, 7 + self.mixed.capacity.hinges, self.places), np.float32)
             return TankTrajectory(time, blank, np.zeros((rows, self.places), np.float32), alive)
         given = self._given()
@@ -313,10 +312,8 @@ class Tank:
         if state is None:
             state = self._blank(given)
             given = given._replace(new=np.ones(self.places, bool))
-        run = self._stretch(rows, stride)
-        state, qpos, energy = run(given, state)
+        state, qpos, energy = self._stretch(rows, stride)(given, state)
         self.state = jax.tree.map(np.asarray, state)
-        time = (self.steps + stride * np.arange(1, rows + 1)) * step
         self.steps += rows * stride
         self._slots.new[:] = False
         return TankTrajectory(time, np.asarray(qpos), np.asarray(energy), alive)
@@ -364,16 +361,11 @@ class Tank:
         shapes = jax.eval_shape(lambda x: self._rollout(x)[1], jax.tree.map(jnp.asarray, given))
         return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
 
-    @cached_property
-    def _programs(self) -> dict[tuple[int, int], Any]:
-        return {}
-
     def _stretch(self, rows: int, stride: int) -> Any:
         """The program for so many rows of so many steps, compiled once."""
         key = rows, stride
         if key not in self._programs:
-            run = partial(self._run, rows, stride)
-            self._programs[key] = jit(run)
+            self._programs[key] = jit(partial(self._run, rows, stride))
         return self._programs[key]
 
     def _run(self, rows: int, stride: int, given: _Given, state: RolloutState) -> Any:
@@ -457,8 +449,6 @@ def make_tank(
     if mixed.world.gust is not None:
         raise InputError("tank", "a world without gusts, which are drawn for episodes", "some")
     if mixed.world.bed is not None and not mixed.touches:
-        raise InputError(
-            "tank: expected a fitness with a colony where there is a bed, which robots reach in a "
-            "long life; found one for episodes that end before"
-        )
+        colony = "a fitness with a colony where there is a bed, which robots reach in a long life"
+        raise InputError("tank", colony, "one for episodes that end before")
     return Tank(mixed, places * worlds, worlds, touch, spheres)
