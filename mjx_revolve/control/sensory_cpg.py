@@ -79,7 +79,6 @@ def make_sensory_cpg(
         ("frequency", "robot"),
         *((what, "actuator") for what in ("offset", *on_offset)),
     )
-
     # Integration steps of the phases between two commands; one without a rate (older versions).
     count = 1 if made_for.rate is None else math.ceil(made_for.timestep / _PHASE_STEP - 1e-6)
     dt = made_for.timestep / count

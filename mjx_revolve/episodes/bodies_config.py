@@ -131,9 +131,7 @@ class ArchiveConfig(Settings):
     @model_validator(mode="after")
     def _check(self) -> ArchiveConfig:
         if len(self.axes) < 2:
-            raise ConstraintError(
-                "axes", "at least two descriptors or measures", str(len(self.axes))
-            )
+            raise ConstraintError("axes", "at least two descriptors or measures", len(self.axes))
         cells = math.prod(axis.cells for axis in self.axes.values())
         if self.type == "grid" and cells > _MOST_CELLS:
             raise ConstraintError("axes", f"at most {_MOST_CELLS:,} cells", f"{cells:,}")
@@ -190,10 +188,10 @@ class BodiesConfig(Settings):
         for low, high in (("min_modules", "max_modules"), ("min_hinges", "max_hinges")):
             least, most = getattr(self, low), getattr(self, high)
             if most < least:
-                raise ConstraintError(high, f"at least {low} ({least})", str(most))
+                raise ConstraintError(high, f"at least {low} ({least})", most)
         if self.max_hinges >= self.max_modules:
             most = f"less than max_modules ({self.max_modules}), of which the core is one"
-            raise ConstraintError("max_hinges", most, str(self.max_hinges))
+            raise ConstraintError("max_hinges", most, self.max_hinges)
         selection = self.selection
         if selection.type == "map_elites" and self.archive is None:
             raise ConstraintError("archive", "axes, because selection.type is map_elites", "none")
@@ -203,7 +201,7 @@ class BodiesConfig(Settings):
             raise ConstraintError("selection.reevaluate", off, "true")
         if selection.elites != 1 and selection.type != "generational":
             what = f"1, as only generational has elites (selection.type is {selection.type})"
-            raise ConstraintError("selection.elites", what, str(selection.elites))
+            raise ConstraintError("selection.elites", what, selection.elites)
         if len(selection.objectives) > 1 and selection.type != "nsga2":
             one = f"one, as only nsga2 takes several (selection.type is {selection.type})"
             raise ConstraintError("selection.objectives", one, ", ".join(selection.objectives))

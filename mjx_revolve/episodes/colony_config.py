@@ -125,9 +125,8 @@ class ColonyConfig(Settings):
     @model_validator(mode="after")
     def _check(self) -> ColonyConfig:
         if self.look > self.interval:
-            raise ConstraintError(
-                "look", f"at most the interval ({self.interval:g} s)", f"{self.look:g}"
-            )
+            most = f"at most the interval ({self.interval:g} s)"
+            raise ConstraintError("look", most, f"{self.look:g}")
         looks = self.interval / self.look
         if abs(looks - round(looks)) > 1e-6 * looks:
             whole = f"a whole part of the interval ({self.interval:g} s)"

@@ -355,11 +355,9 @@ class TaskConfig(Section):
         upright = math.hypot(*self.direction[:2]) < 1e-9
         for name in (name for name, needs in level.items() if needs and upright):
             what = f"one that is not upright, as there is {name}, which is level"
-            raise ConstraintError("direction", what, show(list(self.direction)))
+            raise ConstraintError("direction", what, _plain(self.direction))
         if math.hypot(*self.direction) < 1e-9:
-            raise ConstraintError(
-                "direction", "a vector of some length", show(list(self.direction))
-            )
+            raise ConstraintError("direction", "a vector of some length", _plain(self.direction))
         return self
 
 
@@ -476,10 +474,10 @@ class Config(Settings):
         initial, seeds = self.colony.birth.initial, len(self.bodies.seeds)
         if initial > self.evolution.population_size:
             most = f"at most evolution.population_size ({self.evolution.population_size})"
-            raise ConstraintError("colony.birth.initial", most, str(initial))
+            raise ConstraintError("colony.birth.initial", most, initial)
         if initial < seeds:
             least = f"at least as many as bodies.seeds ({seeds})"
-            raise ConstraintError("colony.birth.initial", least, str(initial))
+            raise ConstraintError("colony.birth.initial", least, initial)
         if self.colony.arena.depth <= self.task.depth:
             least = f"more than task.depth ({self.task.depth:g} m), at which robots are born"
             raise ConstraintError("colony.arena.depth", least, f"{self.colony.arena.depth:g}")

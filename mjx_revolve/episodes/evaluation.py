@@ -195,10 +195,8 @@ class EpisodeSpec(ABC, Generic[B]):
             genes = jnp.asarray(population)
             return genes if jnp.issubdtype(genes.dtype, jnp.floating) else genes.astype(float)
         if count == 0:
-            raise InputError(
-                "population: expected bodies with a hinge or a thruster to control; found none, "
-                "so that there are no genes to evolve"
-            )
+            none = "none, so that there are no genes to evolve"
+            raise InputError("population", "bodies with a hinge or a thruster to control", none)
         wanted = " or ".join(f"[{'B, ' * (rank - 2)}P, {count}]" for rank in ranks)
         raise InputError("population", wanted, list(shape))
 

@@ -126,10 +126,8 @@ class RunReader:
         if self.champion_path is not None:
             return read_champion(self.champion_path)
         find_run(self.path)
-        raise InputError(
-            f"{self.path / 'champion' / 'genes.yaml'}: expected a champion; found none: this run "
-            "was stopped before its first checkpoint, or the file is lost"
-        )
+        none = "none: this run was stopped before its first checkpoint, or the file is lost"
+        raise InputError(self.path / "champion" / "genes.yaml", "a champion", none)
 
 
 # --- metrics --------------------------------------------------------------------------------------
@@ -305,10 +303,8 @@ class ChampionRecord:
         """Its number among the individuals of a run in which bodies evolved."""
         found = self.facts.get("individual")
         if isinstance(found, bool) or not isinstance(found, int):
-            raise InputError(
-                f"{self.path}: individual: expected the champion's number, as bodies have evolved; "
-                f"found {show(found)}"
-            )
+            number = "the champion's number, as bodies have evolved"
+            raise InputError(f"{self.path}: individual", number, show(found))
         return found
 
     def load_run_config(self, **overrides: object) -> Config:
@@ -332,10 +328,8 @@ class ChampionRecord:
             return config
         body = self.facts.get("morphology")
         if not isinstance(body, str) or not (self.path.parent / body).is_file():
-            raise InputError(
-                f"{self.path}: morphology: expected the path of the champion's body, as bodies "
-                f"have evolved; found {show(body)}"
-            )
+            named = "the path of the champion's body, as bodies have evolved"
+            raise InputError(f"{self.path}: morphology", named, show(body))
         return config.for_body((self.path.parent / body).absolute())
 
     def check_genes(self, count: int, named: str) -> None:

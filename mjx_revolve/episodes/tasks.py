@@ -24,8 +24,8 @@ from mjx_revolve.episodes.measure_table import records_of
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.user_code import (
     call_user_function,
+    function_place,
     load_user_function,
-    parse_user_function,
     short_name,
 )
 from mjx_revolve.numerics.spatial import Scalar, safe_norm
@@ -400,19 +400,15 @@ def find_task(settings: TaskConfig, source: str = "config") -> Task:
     task = TASKS[name] if name in TASKS else _load_task(name, f"{source}: task.type")
     for record, fields in _GIVEN.items():
         if record in task.records and all(getattr(settings, field) is None for field in fields):
-            raise InputError(
-                f"{source}: task: expected {' or '.join(fields)}, as {short_name(name)} records "
-                f"the {record}; found none"
-            )
+            what = f"{' or '.join(fields)}, as {short_name(name)} records the {record}"
+            raise InputError(f"{source}: task", what, "none")
     records = dict.fromkeys((*task.records, *records_of(settings.measures)))
     task = replace(task, records=tuple(records), point=settings.point)
     if settings.unit == "m":
         unit = score_unit(name, "m")
         if unit == task.unit:
-            raise InputError(
-                f"{source}: task.unit: expected body_lengths, as the scores of {short_name(name)} "
-                "do not say that they are in body lengths; found m"
-            )
+            what = f"body_lengths, as the scores of {short_name(name)} do not say that they are in "
+            raise InputError(f"{source}: task.unit", what + "body lengths", "m")
         task = replace(task, score=partial(_score_in_metres, task.score), unit=unit)
     if name in TASKS:
         return task
@@ -427,18 +423,13 @@ def find_task(settings: TaskConfig, source: str = "config") -> Task:
     except InputError as error:
         if "NoneType" not in str(error):
             raise
-        hint = (
-            'what it reads of joints, forces and more it records: Task(score, records=("joints",))'
-        )
+        example = 'Task(score, records=("joints",))'
+        hint = f"what it reads of joints, forces and more it records: {example}"
         raise InputError(f"{error}; {hint}") from None
     if not isinstance(found, jax.ShapeDtypeStruct) or found.shape != (_LANES,):
-        own = parse_user_function(name)
-        assert own is not None
         shown = list(found.shape) if isinstance(found, jax.ShapeDtypeStruct) else type(found)
-        raise InputError(
-            f"{own.path}: {own.function}: expected a score for each lane, [{_LANES}] for a "
-            f"position of [{_ROWS}, 3, {_LANES}]; found {shown}"
-        )
+        each = f"a score for each lane, [{_LANES}] for a position of [{_ROWS}, 3, {_LANES}]"
+        raise InputError(function_place(name), each, shown)
     return task
 
 

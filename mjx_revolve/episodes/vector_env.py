@@ -103,8 +103,7 @@ def _make_class() -> type:
                 return state, self._join(seen)
 
             def resume(mask: jax.Array, new: PyTree, old: PyTree) -> PyTree:
-                pick = jax.vmap(choose)
-                return pick(self._split(mask), new, old)
+                return jax.vmap(choose)(self._split(mask), new, old)
 
             self._step = jit(step, donate_argnums=0)
             self._begin, self._resume = jit(begin), jit(resume)
@@ -171,10 +170,8 @@ def _make_class() -> type:
                 known = self._read_seeds(kept)
                 return np.where([x is None for x in found], -1, known)
             if not whole or not np.all((found >= 0) & (found < 2**32)):
-                raise InputError(
-                    f"seed: expected a whole number from 0 to {2**32 - 1}, or {self.num_envs} of "
-                    f"them; found {seed!r}"
-                )
+                wanted = f"a whole number from 0 to {2**32 - 1}, or {self.num_envs} of them"
+                raise InputError("seed", wanted, repr(seed))
             if found.shape == ():
                 found = (int(found) + np.arange(size, dtype=np.int64)) % 2**32
             return found.astype(np.int64)
@@ -184,10 +181,8 @@ def _make_class() -> type:
                 return None
             mask = np.asarray(options["reset_mask"])
             if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
-                raise InputError(
-                    f"options: reset_mask: expected [{self.num_envs}] of bool; found "
-                    f"{list(mask.shape)} of {mask.dtype}"
-                )
+                found = f"{list(mask.shape)} of {mask.dtype}"
+                raise InputError("options: reset_mask", f"[{self.num_envs}] of bool", found)
             return mask
 
         def step(
@@ -282,9 +277,8 @@ def make_vector_env(
     if not whole or num_envs < 1:
         raise InputError("num_envs", "a whole number >= 1", repr(num_envs))
     if autoreset_mode not in AUTORESET_MODES:
-        raise InputError(
-            "autoreset_mode", f"one of {', '.join(AUTORESET_MODES)}", repr(autoreset_mode)
-        )
+        known = f"one of {', '.join(AUTORESET_MODES)}"
+        raise InputError("autoreset_mode", known, repr(autoreset_mode))
     fitness = make_fitness(config, **overrides)
     environment = make_environment(fitness, control_rate, sensors)
     return _make_class()(fitness, environment, int(num_envs), autoreset_mode)

@@ -114,10 +114,8 @@ class TruncatedBPTT:
         fitness, lanes = self.fitness, episodes.score.shape[0]
         population, trials = fitness.check_population(population), fitness.settings.trials
         if len(population) * trials != lanes:
-            raise InputError(
-                f"population: expected [{lanes // trials}, {fitness.num_genes}], as the "
-                f"episodes began with; found {list(population.shape)}"
-            )
+            same = f"[{lanes // trials}, {fitness.num_genes}], as the episodes began with"
+            raise InputError("population", same, list(population.shape))
         clock = episodes.rollout.steps
         if not is_traced(clock) and int(clock[0]) >= fitness.num_timesteps:
             raise InputError("episodes", "some under way", "their end")
@@ -251,14 +249,12 @@ def make_windows(fitness: Fitness, horizon: float | None = None) -> TruncatedBPT
     """
     config, records = fitness.config, fitness.num_records
     if config.engine != "population":
-        raise InputError(
-            f"{config.source}: engine", "population, to go back through its steps", config.engine
-        )
+        needed = "population, to go back through its steps"
+        raise InputError(f"{config.source}: engine", needed, config.engine)
     if config.task.target_turn is not None:
-        raise InputError(
-            f"{config.source}: task.target_turn: expected none, as windows do not carry a pursuer "
-            f"on; found {config.task.target_turn:g}"
-        )
+        none = "none, as windows do not carry a pursuer on"
+        turn = f"{config.task.target_turn:g}"
+        raise InputError(f"{config.source}: task.target_turn", none, turn)
     row = fitness.record_every * fitness.world.timestep
     if horizon is None:
         return TruncatedBPTT(fitness, records)
