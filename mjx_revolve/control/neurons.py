@@ -111,6 +111,7 @@ def _as_list(neurons: object) -> Any:
 
 
 _OrNone = BeforeValidator(lambda value: value or ())
+_Params = Annotated[dict[Id, dict[Text, Any]], BeforeValidator(lambda value: value or {})]
 
 
 @checked
@@ -119,9 +120,7 @@ class _File:
 
     neurons: Annotated[TupleOf[Neuron], BeforeValidator(_as_list)]
     connections: Annotated[TupleOf[Synapse], _OrNone] = ()
-    params: Annotated[dict[Id, dict[Text, Any]], BeforeValidator(lambda x: x or {})] = field(
-        default_factory=dict
-    )
+    params: _Params = field(default_factory=dict)
     type: Any = None
 
     def __post_init__(self) -> None:

@@ -316,16 +316,14 @@ def read_sensors(
     Raises:
         InputError: there is no such module.
     """
-    root = engine.root(state)
-    rotation = quat_to_mat(root.quat)
+    position, quat, velocity, angular_velocity = engine.root(state)
+    rotation = quat_to_mat(quat)
     angle, speed = engine.joints(state)
-    zero = jnp.zeros_like(root.position[2])
+    zero = jnp.zeros_like(position[2])
     target = None
     if context.target is not None:
         target = context.target_at(time) if memory.pursuer is None else memory.pursuer.position
-    frame = _Frame(
-        root.position, rotation, root.velocity, root.angular_velocity, memory.acceleration
-    )
+    frame = _Frame(position, rotation, velocity, angular_velocity, memory.acceleration)
     nearest = None
     if "nearest" in signals:
         lone = meeting.nearest is None
@@ -476,7 +474,5 @@ def readings_at_rest(plant: Plant, lanes: int, signals: Sequence[str]) -> Sensor
     noise = jnp.zeros(lanes, jnp.uint32)
     context = EpisodeContext(noise=noise)
     memory = init_memory(signals, engine, (), context)
-    water = Water(0.0, (0.0, 0.0, 0.0))
-    return read_sensors(
-        None, engine, (), water, jnp.zeros((), jnp.float32), context, memory, signals
-    )
+    water, time = Water(0.0, (0.0, 0.0, 0.0)), jnp.zeros((), jnp.float32)
+    return read_sensors(None, engine, (), water, time, context, memory, signals)

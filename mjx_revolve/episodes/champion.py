@@ -236,10 +236,7 @@ def _individual(path: Path, number: int, duration: float | None, seed: int | Non
 
 
 def load_individuals(
-    path: str | Path,
-    numbers: Sequence[int],
-    duration: float | None = None,
-    seed: int | None = None,
+    path: str | Path, numbers: Sequence[int], duration: float | None = None, seed: int | None = None
 ) -> list[Episode]:
     """The episodes of many individuals at once, by one compiled program.
 

@@ -203,9 +203,8 @@ class Environment:
         now = now._replace(controller_state=())
         now, _ = rollout.advance(now, lambda *_: (), 1, self.every, inputs)
         clock = before.steps + self.every
-        now = now._replace(
-            controller_state=before.controller_state, energy=before.energy + now.energy, steps=clock
-        )
+        seen, energy = before.controller_state, before.energy + now.energy
+        now = now._replace(controller_state=seen, energy=energy, steps=clock)
         episodes = episodes._replace(rollout=now)
 
         rollout, present = self._at(episodes, ctrl, clock - 1)

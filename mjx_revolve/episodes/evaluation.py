@@ -210,15 +210,26 @@ class EpisodeSpec(ABC, Generic[B]):
         clock: Int[Array, " lanes"] | None = None,
     ) -> Rollout:
         """The rollout of episodes from these starts and core positions."""
-        return Rollout(
-            with_variation(engine, starts.variation),
-            policy,
-            self.world,
-            steady_water(self.world, starts),
-            episode_context(self.settings, starts, position),
-            signals,
-            clock,
-        )
+        engine, water = with_variation(engine, starts.variation), steady_water(self.world, starts)
+        context = episode_context(self.settings, starts, position)
+        return Rollout(engine, policy, self.world, water, context, signals, clock)
+
+    def start_rollout(
+        self, engine: Engine, genes: jax.Array, starts: Starts, root: Float[Array, "7 lanes"]
+    ) -> tuple[Rollout, RolloutState]:
+        """The rollout of episodes under the controller, and its state before the first step.
+
+        Args:
+            engine: of the bodies.
+            genes: `[num_genes, lanes]`.
+            starts: of the episodes.
+            root: poses of the cores at the start, from `start_pose`.
+        """
+        controller, parameters = self.controller, self.controller.decode(genes, engine.plant)
+        policy = controlled(controller, parameters)
+        rollout = self.make_rollout(engine, policy, controller.signals, starts, root[:3])
+        state = start_at_rest(rollout.engine, root)
+        return rollout, rollout.init(state, controller.init(parameters))
 
     def init_episodes(
         self, now: RolloutState, starts: Starts, position: Float[Array, "3 lanes"], row: Any
@@ -278,24 +289,17 @@ class EpisodeSpec(ABC, Generic[B]):
             score = differentiate_as(score, partial(self._score_chunk, alike, True))
         return partial(score, bodies, population, starts)
 
-    def _score_chunk(
-        self,
-        alike: bool,
-        differentiable: bool,
-        bodies: B,
-        population: jax.Array,
-        starts: Starts,
-        individual: Int[Array, " lanes"],
-        trial: Int[Array, " lanes"],
-    ) -> Scores:
-        """Scores of one chunk of episodes."""
-        chunk = self.prepare(alike, differentiable, bodies, population, starts, individual, trial)
-        rollout = chunk.rollout
-        recorder = task_recorder(rollout.engine, self.task, self.world)
-        _, track = rollout.advance(
-            chunk.state, recorder, self.num_records, self.record_every, chunk.inputs, differentiable
-        )
-        return self.score(track, chunk.position, chunk.geometry, rollout.context)
+    def _score_chunk(self, alike: bool, differentiable: bool, *given: Any) -> Scores:
+        """Scores of one chunk of episodes; arguments of `prepare`."""
+        chunk = self.prepare(alike, differentiable, *given)
+        track = self.record_track(chunk, differentiable)
+        return self.score(track, chunk.position, chunk.geometry, chunk.rollout.context)
+
+    def record_track(self, chunk: Chunk, differentiable: bool = False) -> dict[str, jax.Array]:
+        """The track of a chunk of episodes, from their starts to their ends."""
+        recorder = task_recorder(chunk.rollout.engine, self.task, self.world)
+        size = self.num_records, self.record_every
+        return chunk.rollout.advance(chunk.state, recorder, *size, chunk.inputs, differentiable)[1]
 
     def prepare(
         self,
@@ -318,12 +322,8 @@ class EpisodeSpec(ABC, Generic[B]):
         geometry = self._geometry(bodies)
         root = self.start_pose(geometry, starts)
         engine = self._engine(bodies, root.shape[-1], differentiable)
-        parameters = self.controller.decode(population[individual].T, engine.plant)
-        policy = controlled(self.controller, parameters)
-        rollout = self.make_rollout(engine, policy, self.controller.signals, starts, root[:3])
-        state = start_at_rest(rollout.engine, root)
+        rollout, now = self.start_rollout(engine, population[individual].T, starts, root)
         inputs = StepInputs(gust_rows(self.world, starts, self.num_timesteps))
-        now = rollout.init(state, self.controller.init(parameters))
         return Chunk(rollout, now, inputs, self.start_point(geometry, starts), geometry)
 
     def score(
@@ -475,9 +475,8 @@ def task_recorder(engine: Engine, task: Task, world: World) -> Recorder:
         if "water" in task.records:
             velocity, _ = flow(world, water, *place)
             like = now.energy
-            row["water_velocity"] = jnp.stack(
-                [jnp.broadcast_to(jnp.asarray(v, like.dtype), like.shape) for v in velocity]
-            )
+            wide = [jnp.broadcast_to(jnp.asarray(v, like.dtype), like.shape) for v in velocity]
+            row["water_velocity"] = jnp.stack(wide)
         if now.memory.pursuer is not None:
             row["target"] = jnp.stack(now.memory.pursuer.position)
         return row

@@ -160,9 +160,8 @@ def read_individuals(folder: Path) -> tuple[dict[int, LoggedIndividual], list[st
     for line, text in lines:
         score = math.nan if line.score is None else line.score
         features = {"score": score, **line.descriptors, **line.measures}
-        found[line.id] = LoggedIndividual(
-            line.id, line.parents, line.born, line.origin, score, features, text
-        )
+        origin = line.parents, line.born, line.origin
+        found[line.id] = LoggedIndividual(line.id, *origin, score, features, text)
     return found, wrong
 
 
@@ -209,9 +208,8 @@ def read_events(folder: Path) -> tuple[list[Event], list[str]]:
     found = []
     for line, _ in lines:
         place = np.array([math.nan if x is None else x for x in line.place])
-        found.append(
-            Event(line.time, line.event, line.id, place, line.other, line.cause, line.parents)
-        )
+        more = line.other, line.cause, line.parents
+        found.append(Event(line.time, line.event, line.id, place, *more))
     # Within an interval they are as they were written.
     return sorted(found, key=lambda event: event.time), wrong
 

@@ -28,7 +28,7 @@ from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.self_overlap import self_overlap
 from mjx_revolve.engine.variation import Variation
-from mjx_revolve.episodes.evaluation import Chunk, as_precise, task_recorder
+from mjx_revolve.episodes.evaluation import Chunk, as_precise
 from mjx_revolve.episodes.fitness import Fitness, fit_body
 from mjx_revolve.episodes.scoring import PASSPORT_STREAM, replay_key
 from mjx_revolve.episodes.simulate import Trajectory
@@ -287,9 +287,8 @@ def _all_lanes(tried: Mapping[str, tuple[str, Variation]]) -> _Lanes:
     rows = [Variation()] * _STARTS
     rows += [variation for _, variation in tried.values() for _ in range(_FEW)]
     rows += [Variation()] * _FEW
-    return _Lanes(
-        start, brain, Variation(*(np.array(x, np.float32) for x in zip(*rows, strict=True)))
-    )
+    factors = (np.array(x, np.float32) for x in zip(*rows, strict=True))
+    return _Lanes(start, brain, Variation(*factors))
 
 
 def _with_step(fitness: Fitness, part: int) -> Fitness:
@@ -341,10 +340,7 @@ def _scores(
 
         def swim(brain: jax.Array, lane: jax.Array) -> dict[float, jax.Array]:
             chunk = whole.prepare(True, False, (), population, starts, brain, lane)
-            recorder = task_recorder(chunk.rollout.engine, whole.task, whole.world)
-            _, track = chunk.rollout.advance(
-                chunk.state, recorder, whole.num_records, whole.record_every, chunk.inputs
-            )
+            track = whole.record_track(chunk)
             return {
                 seconds: _score(one, chunk, jax.tree.map(lambda x, n=one.num_records: x[:n], track))
                 for seconds, one in specs.items()
@@ -429,9 +425,8 @@ def joint_checks(
         return
     time, step = np.asarray(trajectory.time), robot.world.timestep
     rows, step = time >= settle, step * round(float(time[1] - time[0]) / step)
-    qpos, qvel, ctrl = (
-        np.asarray(x)[rows] for x in (trajectory.qpos, trajectory.qvel, trajectory.ctrl)
-    )
+    motion = trajectory.qpos, trajectory.qvel, trajectory.ctrl
+    qpos, qvel, ctrl = (np.asarray(x)[rows] for x in motion)
     moved, varied = robot.assembly.moved, trajectory.variation
     # To a micrometre: some bodies overlap by 3 mm at rest, by design.
     depth = np.abs(np.round(1000 * self_overlap(robot, qpos).depth, 3))  # rather than -0

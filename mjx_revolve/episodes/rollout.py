@@ -171,19 +171,8 @@ class Rollout:
     ) -> tuple[Float[Array, "..."], Water, SensorReadings]:
         """Time [s], water and sensor readings; `motion`: of all bodies, where it is known."""
         time, water = self._episode_time(now.steps, now), self.water_at(now.steps, now, inputs)
-        readings = read_sensors(
-            self.world,
-            self.engine,
-            now.state,
-            water,
-            time,
-            self.context,
-            now.memory,
-            self.signals,
-            forces,
-            motion,
-        )
-        return time, water, readings
+        given = now.state, water, time, self.context, now.memory, self.signals
+        return time, water, read_sensors(self.world, self.engine, *given, forces, motion)
 
     def act(
         self, now: RolloutState, inputs: StepInputs, forces: InteractionForces = NO_INTERACTION
@@ -207,11 +196,10 @@ class Rollout:
         motion: BodyMotion | None,
     ) -> RolloutState:
         """The second half of a step: the state after the engine's step and `act`."""
-        root, dt = self.engine.root, self.world.timestep
+        before, after = self.engine.root(now.state), self.engine.root(state)
+        dt, context = self.world.timestep, self.context
         work = dt * power
-        memory = update_memory(
-            now.memory, root(now.state), root(state), ctrl, work, dt, motion, self.context
-        )
+        memory = update_memory(now.memory, before, after, ctrl, work, dt, motion, context)
         return RolloutState(state, controller_state, memory, now.energy + work, now.steps + 1)
 
     def step(
@@ -296,14 +284,12 @@ class Rollout:
         def block(carry: PyTree, rows: StepInputs) -> tuple[PyTree, PyTree]:
             packed, neighbours = carry
             begun = unpack(packed)
-            begun = pack(begun._replace(energy=jnp.zeros_like(begun.energy)))
+            carry = pack(begun._replace(energy=jnp.zeros_like(begun.energy))), neighbours
             last = jax.tree.map(lambda x: x[-1], rows)
             if every == 1:
-                carry, ctrl = detect_and_step((begun, neighbours), last)
+                carry, ctrl = detect_and_step(carry, last)
             else:
-                carry, ctrls = jax.lax.scan(
-                    detect_and_step, (begun, neighbours), rows, length=every
-                )
+                carry, ctrls = jax.lax.scan(detect_and_step, carry, rows, length=every)
                 ctrl = jax.tree.map(lambda x: x[-1], ctrls)
             return carry, self.record(recorder, unpack(carry[0]), ctrl, last)
 

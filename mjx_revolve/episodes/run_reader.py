@@ -164,8 +164,7 @@ def read_metrics(path: Path) -> MetricsTable:
         return MetricsTable({})
     header = lines[0] if lines else []
     if "generation" not in header or len(set(header)) < len(header):
-        found = str(header)[:60]
-        damage = f"expected a header with a column generation; found {found}"
+        damage = f"expected a header with a column generation; found {str(header)[:60]}"
         return MetricsTable({}, damage=damage)
     rows: dict[float, list[float]] = {}
     place = header.index("generation")

@@ -157,9 +157,8 @@ def average_trials(scores: Scores, trials: int) -> tuple[jax.Array, dict[str, ja
     """
     mean = lambda x: jnp.mean(x.reshape(-1, trials), 1)  # noqa: E731
     sane = jnp.all(scores.sane.reshape(-1, trials), 1)
-    return jnp.where(sane, jnp.maximum(mean(scores.score), _LEAST), WORST), {
-        name: mean(values) for name, values in scores.measures.items()
-    }
+    measures = {name: mean(values) for name, values in scores.measures.items()}
+    return jnp.where(sane, jnp.maximum(mean(scores.score), _LEAST), WORST), measures
 
 
 def replay_key(seed: int) -> jax.Array:

@@ -115,16 +115,15 @@ def _compiled(
 
         now = rollout.init(simulator.init(qpos[:, None], qvel[:, None]), controller_state)
         inputs = StepInputs(moving, targets)
-        _, (states, ctrl, energy, pursuer) = rollout.advance(
-            now, record, steps, 1, inputs, differentiable
-        )
+        _, rows = rollout.advance(now, record, steps, 1, inputs, differentiable)
+        states, ctrl, energy, pursuer = rows
         time = dt * jnp.arange(1, steps + 1, dtype=energy.dtype)
         target = None if pursuer is None else jnp.stack(pursuer.position, 1)
         if target is None and context.target is not None:
             target = target_path(context, time)
         qs, vs = jax.vmap(simulator.observe)(states)
         return Trajectory(
-            time=dt * jnp.arange(1, steps + 1, dtype=qs.dtype),
+            time=time,
             qpos=qs[..., 0],
             qvel=vs[..., 0],
             xpos=body_poses(robot, qs[..., 0])[0],

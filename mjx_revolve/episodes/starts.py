@@ -297,11 +297,8 @@ def pick_water(world: World, starts: Starts, trial: int) -> Water | None:
 def _euler_quat(roll: jax.Array, pitch: jax.Array, yaw: jax.Array) -> jax.Array:
     """`[4, n]` quaternion (w, x, y, z) of roll, then pitch, then yaw [rad]."""
     (cr, sr), (cp, sp), (cy, sy) = ((jnp.cos(x / 2), jnp.sin(x / 2)) for x in (roll, pitch, yaw))
-    return jnp.stack(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ]
-    )
+    w = cr * cp * cy + sr * sp * sy
+    x = sr * cp * cy - cr * sp * sy
+    y = cr * sp * cy + sr * cp * sy
+    z = cr * cp * sy - sr * sp * cy
+    return jnp.stack([w, x, y, z])

@@ -343,18 +343,12 @@ class Tank:
         target = None if given.target is None else tuple(given.target)
         far = self.mixed.settings.sight
         sight = None if far is None else jnp.full(given.noise.shape, far, given.genes.dtype)
-        rollout = Rollout(
-            engine,
-            controlled(controller, parameters),
-            self.world,
-            Water(self.world.surface_height, tuple(given.current), time=given.time),
-            EpisodeContext(target, None, given.noise, sight),
-            controller.signals,
-            birth=given.since,
-        )
-        return rollout, rollout.init(
-            start_at_rest(engine, given.start), controller.init(parameters)
-        )
+        context = EpisodeContext(target, None, given.noise, sight)
+        policy, world, signals = controlled(controller, parameters), self.world, controller.signals
+        water = Water(world.surface_height, tuple(given.current), time=given.time)
+        rollout = Rollout(engine, policy, world, water, context, signals, birth=given.since)
+        state = start_at_rest(engine, given.start)
+        return rollout, rollout.init(state, controller.init(parameters))
 
     def _blank(self, given: _Given) -> RolloutState:
         """Zeros of its shapes."""

@@ -52,12 +52,11 @@ def advance_taped(
     carry = (now, still)
     pack, unpack = in_one_array(carry)
     first = jax.tree.map(lambda x: x[0, 0], inputs)
-    ahead, back = fused_back(
-        lambda carry, row, offset: rollout.step(carry[0], (row, NO_INTERACTION), offset),
-        carry,
-        first,
-        still,
-    )
+
+    def step(carry: PyTree, row: StepInputs, offset: jax.Array) -> PyTree:
+        return rollout.step(carry[0], (row, NO_INTERACTION), offset)
+
+    ahead, back = fused_back(step, carry, first, still)
 
     def renew(block: PyTree, scalars: PyTree) -> PyTree:
         """Packed, without the work so far: that of a record is its own."""

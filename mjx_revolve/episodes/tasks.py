@@ -413,19 +413,15 @@ def find_task(settings: TaskConfig, source: str = "config") -> Task:
     if name in TASKS:
         return task
     try:
+        expected, example = f"{short_name(name)} to score a track", _example_track(task.records)
         found = call_user_function(
-            name,
-            f"{short_name(name)} to score a track",
-            jax.eval_shape,
-            lambda track: task.score(track, settings),
-            _example_track(task.records),
+            name, expected, jax.eval_shape, lambda track: task.score(track, settings), example
         )
     except InputError as error:
         if "NoneType" not in str(error):
             raise
-        example = 'Task(score, records=("joints",))'
-        hint = f"what it reads of joints, forces and more it records: {example}"
-        raise InputError(f"{error}; {hint}") from None
+        hint = "what it reads of joints, forces and more it records"
+        raise InputError(f'{error}; {hint}: Task(score, records=("joints",))') from None
     if not isinstance(found, jax.ShapeDtypeStruct) or found.shape != (_LANES,):
         shown = list(found.shape) if isinstance(found, jax.ShapeDtypeStruct) else type(found)
         each = f"a score for each lane, [{_LANES}] for a position of [{_ROWS}, 3, {_LANES}]"

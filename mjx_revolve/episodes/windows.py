@@ -27,10 +27,8 @@ from mjx_revolve.episodes.evaluation import Episodes, narrow, task_recorder, wid
 from mjx_revolve.episodes.fitness import Fitness
 from mjx_revolve.episodes.rollout import (
     Rollout,
-    RolloutState,
     StepInputs,
     controlled,
-    start_at_rest,
 )
 from mjx_revolve.episodes.scoring import extend_track, list_episodes, pick_near
 from mjx_revolve.episodes.starts import Starts, check_key, gust_rows
@@ -145,7 +143,7 @@ class TruncatedBPTT:
         """Episodes of a chunk at their starts."""
         fitness = self.fitness
         root = fitness.start_pose(fitness.geometry, starts)
-        rollout, now = self._at_rest(genes, starts, root)
+        rollout, now = fitness.start_rollout(fitness.engine, genes, starts, root)
         inputs = jax.tree.map(lambda x: x[0, 0], self._inputs(starts, now.steps))
         recorder = task_recorder(rollout.engine, fitness.task, fitness.world)
         row = partial(rollout.record, recorder, now, self._still(genes), inputs)
@@ -155,15 +153,6 @@ class TruncatedBPTT:
         controller, engine = self.fitness.controller, self.fitness.engine
         policy = controlled(controller, parameters)
         return self.fitness.make_rollout(engine, policy, controller.signals, starts, position)
-
-    def _at_rest(
-        self, genes: jax.Array, starts: Starts, root: jax.Array
-    ) -> tuple[Rollout, RolloutState]:
-        """A chunk's rollout, and its state before the first step."""
-        controller, engine = self.fitness.controller, self.fitness.engine
-        parameters = controller.decode(genes, engine.plant)
-        rollout = self._rollout(starts, root[:3], parameters)
-        return rollout, rollout.init(start_at_rest(engine, root), controller.init(parameters))
 
     def _still(self, genes: jax.Array) -> Float[Array, "n lanes"]:
         """No commands."""
@@ -184,18 +173,11 @@ class TruncatedBPTT:
         make = partial(self._rollout, starts, episodes.position)
         rollout = make(parameters)
         root = jax.ShapeDtypeStruct((7, genes.shape[-1]), genes.dtype)
-        like = jax.eval_shape(lambda root: self._at_rest(genes, starts, root)[1], root)
-        now = narrow(episodes.rollout, like)
-        then, rows, pull = advance_taped(
-            make,
-            task_recorder(rollout.engine, fitness.task, fitness.world),
-            parameters,
-            now,
-            self._still(genes),
-            self._inputs(starts, now.steps),
-            records=self.records,
-            every=every,
-        )
+        begin = partial(fitness.start_rollout, fitness.engine, genes, starts)
+        now = narrow(episodes.rollout, jax.eval_shape(begin, root)[1])
+        recorder = task_recorder(rollout.engine, fitness.task, fitness.world)
+        given = parameters, now, self._still(genes), self._inputs(starts, now.steps)
+        then, rows, pull = advance_taped(make, recorder, *given, records=self.records, every=every)
         score, by_rows, track = self._judge(rows, episodes, rollout.context, now.steps)
         by_now, by_parameters = pull(by_rows)
         # A controller's state at the start may depend on its genes.

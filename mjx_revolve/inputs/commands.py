@@ -163,18 +163,10 @@ def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_colony_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds `--colony` and `--time`, which name a whole colony instead of an episode."""
-    parser.add_argument(
-        "--colony",
-        action="store_true",
-        help="a run's whole colony, which lives on for --duration (default: 60 s) from its newest "
-        "checkpoint",
-    )
-    parser.add_argument(
-        "--time",
-        type=read_seconds,
-        metavar="S",
-        help="with --colony: from this time of its life on, in seconds",
-    )
+    lives = "which lives on for --duration (default: 60 s) from its newest checkpoint"
+    parser.add_argument("--colony", action="store_true", help=f"a run's whole colony, {lives}")
+    begins = "with --colony: from this time of its life on, in seconds"
+    parser.add_argument("--time", type=read_seconds, metavar="S", help=begins)
 
 
 def check_colony_arguments(arguments: argparse.Namespace) -> None:

@@ -169,9 +169,8 @@ def checked(kind: type[T]) -> type[T]:
 
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:  # noqa: N807
         try:
-            made.__pydantic_validator__.validate_python(
-                ArgsKwargs(args, kwargs), self_instance=self
-            )
+            arguments = ArgsKwargs(args, kwargs)
+            made.__pydantic_validator__.validate_python(arguments, self_instance=self)
         except ValidationError as error:
             given = dict(zip(fields_of(made), args, strict=False)) | kwargs
             name = f" {show(given['name'])}" if "name" in given else ""
