@@ -471,8 +471,7 @@ def readings_at_rest(plant: Plant, lanes: int, signals: Sequence[str]) -> Sensor
         InputError: there is no such module.
     """
     engine: Any = _RestingEngine(plant, lanes)
-    noise = jnp.zeros(lanes, jnp.uint32)
-    context = EpisodeContext(noise=noise)
+    context = EpisodeContext(noise=jnp.zeros(lanes, jnp.uint32))
     memory = init_memory(signals, engine, (), context)
     water, time = Water(0.0, (0.0, 0.0, 0.0)), jnp.zeros((), jnp.float32)
     return read_sensors(None, engine, (), water, time, context, memory, signals)

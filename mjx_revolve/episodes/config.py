@@ -434,7 +434,7 @@ class Config(Settings):
     @model_validator(mode="after")
     def _check(self) -> Config:
         if self.colony is not None:
-            self._check_colony()
+            self._check_colony(self.colony)
         if self.bodies is None:
             if self.morphology is None:
                 what = "the path of a morphology YAML, or bodies: how they evolve"
@@ -458,7 +458,7 @@ class Config(Settings):
                 raise ConstraintError(f"evolution.{name}", what, repr(found))
         return self
 
-    def _check_colony(self) -> None:
+    def _check_colony(self, colony: ColonyConfig) -> None:
         """Refuses settings that a colony does not use."""
         if self.bodies is None:
             raise ConstraintError("bodies", "how bodies evolve, as there is a colony", "nothing")
@@ -470,17 +470,16 @@ class Config(Settings):
                 raise ConstraintError(f"bodies.{name}", what, "some settings")
         if self.bodies.archive is not None:
             raise ConstraintError("bodies.archive", "none, as there is a colony", "one")
-        assert self.colony is not None
-        initial, seeds = self.colony.birth.initial, len(self.bodies.seeds)
+        initial, seeds = colony.birth.initial, len(self.bodies.seeds)
         if initial > self.evolution.population_size:
             most = f"at most evolution.population_size ({self.evolution.population_size})"
             raise ConstraintError("colony.birth.initial", most, initial)
         if initial < seeds:
             least = f"at least as many as bodies.seeds ({seeds})"
             raise ConstraintError("colony.birth.initial", least, initial)
-        if self.colony.arena.depth <= self.task.depth:
+        if colony.arena.depth <= self.task.depth:
             least = f"more than task.depth ({self.task.depth:g} m), at which robots are born"
-            raise ConstraintError("colony.arena.depth", least, f"{self.colony.arena.depth:g}")
+            raise ConstraintError("colony.arena.depth", least, f"{colony.arena.depth:g}")
 
     _source: str = PrivateAttr("config")
     _overrides: _Overrides = PrivateAttr(_Overrides())

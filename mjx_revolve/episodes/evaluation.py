@@ -446,8 +446,7 @@ def narrow(now: RolloutState, like: RolloutState) -> RolloutState:
 def as_precise(tree: PyTree, like: jax.Array) -> PyTree:
     """The tree with its floats in the precision of `like`."""
     number = lambda x: jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
-    cast = lambda x: x.astype(like.dtype) if number(x) else x  # noqa: E731
-    return jax.tree.map(cast, tree)
+    return jax.tree.map(lambda x: x.astype(like.dtype) if number(x) else x, tree)
 
 
 def task_recorder(engine: Engine, task: Task, world: World) -> Recorder:

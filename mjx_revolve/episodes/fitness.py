@@ -81,8 +81,8 @@ class Fitness(EpisodeSpec[tuple[()]]):
 
     def __repr__(self) -> str:
         """A line: `Fitness(directed_swim in lake, Morphology('spider': ...), 57 genes)`."""
-        what = self.config.subject
-        return f"Fitness({what}, {self.robot.morphology!r}, {self.num_genes} genes)"
+        what = f"{self.config.subject}, {self.robot.morphology!r}"
+        return f"Fitness({what}, {self.num_genes} genes)"
 
     def _engine(self, bodies: tuple[()], lanes: int, differentiable: bool) -> Engine:
         return self.engine
@@ -258,8 +258,7 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
 
     def __repr__(self) -> str:
         """A line: `MixedFitness(directed_swim in lake, at most 113 genes)`."""
-        what = self.config.subject
-        return f"MixedFitness({what}, at most {self.num_genes} genes)"
+        return f"MixedFitness({self.config.subject}, at most {self.num_genes} genes)"
 
     def _engine(self, bodies: PackedBodies, lanes: int, differentiable: bool) -> Engine:
         trees = make_batched_trees(self.world, self.capacity, bodies, lanes, steady=differentiable)

@@ -61,8 +61,7 @@ def make_env(config: Any, **settings: Any) -> Any:
 
     for name in ("num_envs", "autoreset_mode"):
         if name in settings:
-            found = show(settings[name])
-            raise InputError(name, "none, as this is a single Env", found)
+            raise InputError(name, "none, as this is a single Env", show(settings[name]))
     settings.pop("render_mode", None)
     return _make_class()(make_vector_env(config, 1, **settings))
 

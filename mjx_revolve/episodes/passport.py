@@ -352,8 +352,7 @@ def _scores(
     # Kept, the programs are there for the next champion of this body.
     made_of = jax.tree.map(np.ndarray.tolist, lanes)
     # That of half a step is sooner swum than compiled well.
-    program = fitness.keep(run, "passport", made_of, times, fast=part == 2)
-    found = program(genes, key)
+    found = fitness.keep(run, "passport", made_of, times, fast=part == 2)(genes, key)
     return {seconds: np.asarray(x, float) for seconds, x in found.items()}
 
 

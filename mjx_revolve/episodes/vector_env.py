@@ -166,8 +166,7 @@ def _make_class() -> type:
             found, size = np.asarray(seed), self.num_envs
             whole = np.issubdtype(found.dtype, np.integer) and found.shape in ((), (size,))
             if found.dtype == object and found.shape == (size,):
-                kept = [0 if x is None else x for x in found]
-                known = self._read_seeds(kept)
+                known = self._read_seeds([0 if x is None else x for x in found])
                 return np.where([x is None for x in found], -1, known)
             if not whole or not np.all((found >= 0) & (found < 2**32)):
                 wanted = f"a whole number from 0 to {2**32 - 1}, or {self.num_envs} of them"
