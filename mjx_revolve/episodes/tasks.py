@@ -407,8 +407,8 @@ def find_task(settings: TaskConfig, source: str = "config") -> Task:
     if settings.unit == "m":
         unit = score_unit(name, "m")
         if unit == task.unit:
-            what = f"body_lengths, as the scores of {short_name(name)} do not say that they are in "
-            raise InputError(f"{source}: task.unit", what + "body lengths", "m")
+            reason = f"as the scores of {short_name(name)} do not say that they are in body lengths"
+            raise InputError(f"{source}: task.unit", f"body_lengths, {reason}", "m")
         task = replace(task, score=partial(_score_in_metres, task.score), unit=unit)
     if name in TASKS:
         return task

@@ -25,11 +25,7 @@ from numpy.typing import ArrayLike
 from mjx_revolve.control.readings import EpisodeContext
 from mjx_revolve.episodes.evaluation import Episodes, narrow, task_recorder, widen
 from mjx_revolve.episodes.fitness import Fitness
-from mjx_revolve.episodes.rollout import (
-    Rollout,
-    StepInputs,
-    controlled,
-)
+from mjx_revolve.episodes.rollout import Rollout, StepInputs, controlled
 from mjx_revolve.episodes.scoring import extend_track, list_episodes, pick_near
 from mjx_revolve.episodes.starts import Starts, check_key, gust_rows
 from mjx_revolve.episodes.tape import advance_taped, float_leaves, wide_leaves
@@ -174,7 +170,7 @@ class TruncatedBPTT:
         rollout = make(parameters)
         root = jax.ShapeDtypeStruct((7, genes.shape[-1]), genes.dtype)
         begin = partial(fitness.start_rollout, fitness.engine, genes, starts)
-        now = narrow(episodes.rollout, jax.eval_shape(begin, root)[1])
+        now = narrow(episodes.rollout, jax.eval_shape(lambda root: begin(root)[1], root))
         recorder = task_recorder(rollout.engine, fitness.task, fitness.world)
         given = parameters, now, self._still(genes), self._inputs(starts, now.steps)
         then, rows, pull = advance_taped(make, recorder, *given, records=self.records, every=every)
