@@ -196,9 +196,9 @@ class Rollout:
         motion: BodyMotion | None,
     ) -> RolloutState:
         """The second half of a step: the state after the engine's step and `act`."""
-        before, after = self.engine.root(now.state), self.engine.root(state)
         dt, context = self.world.timestep, self.context
         work = dt * power
+        before, after = self.engine.root(now.state), self.engine.root(state)
         memory = update_memory(now.memory, before, after, ctrl, work, dt, motion, context)
         return RolloutState(state, controller_state, memory, now.energy + work, now.steps + 1)
 
