@@ -19,6 +19,7 @@ import numpy as np
 from annotated_types import Ge, Unit
 from pydantic import BeforeValidator, Strict
 
+from mjx_revolve.genotypes.genotype import pick
 from mjx_revolve.inputs.schema import (
     Boolean,
     ConstraintError,
@@ -212,7 +213,7 @@ def _add_node(rng: np.random.Generator, network: CPPN, settings: CPPNSettings) -
             number = int(rng.integers(_NUMBERS))
     order = [node.number for node in network.nodes]
     place = order.index(target) if target in order else len(order)
-    node = Node(number, _draw_function(rng))
+    node = Node(number, pick(rng, [*FUNCTIONS]))
     return network._replace(
         nodes=(*network.nodes[:place], node, *network.nodes[place:]),
         links=(
@@ -271,12 +272,8 @@ def _change_function(rng: np.random.Generator, network: CPPN, settings: CPPNSett
     if not network.nodes:
         return network
     which = int(rng.integers(len(network.nodes)))
-    node = network.nodes[which]._replace(function=_draw_function(rng))
+    node = network.nodes[which]._replace(function=pick(rng, [*FUNCTIONS]))
     return network._replace(nodes=(*network.nodes[:which], node, *network.nodes[which + 1 :]))
-
-
-def _draw_function(rng: np.random.Generator) -> str:
-    return [*FUNCTIONS][int(rng.integers(len(FUNCTIONS)))]
 
 
 def cross_cppns(rng: np.random.Generator, a: CPPN, b: CPPN, settings: CPPNSettings) -> CPPN:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
@@ -267,6 +267,13 @@ def make_genotype(
         from_plain=read,
         settle=settle,
     )
+
+
+def pick(rng: np.random.Generator, things: Sequence[T]) -> T:
+    """A random one of several things; raises `InputError` if there is none."""
+    if not things:
+        raise InputError("variation", "anything to choose from", "nothing")
+    return things[int(rng.integers(len(things)))]
 
 
 def cached(function: Callable[[G], T]) -> Callable[[G], T]:

@@ -29,7 +29,7 @@ from annotated_types import Ge, Unit
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.body.tree import Morphology
-from mjx_revolve.genotypes.genotype import Genotype, Space, make_genotype
+from mjx_revolve.genotypes.genotype import Genotype, Space, make_genotype, pick
 from mjx_revolve.genotypes.growth import Growth
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.schema import (
@@ -343,7 +343,7 @@ def _draw_rules(
     kinds = (tuple(MOUNTING), names, tuple(MOVING))
     rules = {}
     for letter in (CORE, *names):
-        rule = [kind[int(rng.integers(len(kind)))] for _ in range(count) for kind in kinds]
+        rule = [pick(rng, kind) for _ in range(count) for kind in kinds]
         rules[letter] = (CORE, *rule) if letter == CORE else tuple(rule)
     return rules
 
@@ -352,25 +352,20 @@ def _mutate(
     rng: np.random.Generator, grammar: Grammar, names: Sequence[str], settings: PlasticodingSettings
 ) -> Grammar | None:
     """One letter added, deleted or exchanged in a rule that is used; None if impossible."""
-    used = _used(grammar.rules)
-    letter = used[int(rng.integers(len(used)))]
+    letter = pick(rng, _used(grammar.rules))
     rule = [*grammar.rules[letter]]
     first = int(letter == CORE)  # the core's letter stays at the beginning of its rule
     drawn = rng.random() * (settings.add + settings.delete + settings.swap)
     if drawn < settings.add:
         if len(rule) - first >= settings.max_rule:
             return None
-        kinds = (names, tuple(MOUNTING), tuple(MOVING))
-        kind = kinds[rng.integers(len(kinds))]
-        new = kind[int(rng.integers(len(kind)))]
+        new = pick(rng, pick(rng, (names, tuple(MOUNTING), tuple(MOVING))))
         rule.insert(int(rng.integers(first, len(rule) + 1)), new)
+    elif len(rule) <= first:
+        return None
     elif drawn < settings.add + settings.delete:
-        if len(rule) <= first:
-            return None
         del rule[int(rng.integers(first, len(rule)))]
     else:
-        if len(rule) <= first:
-            return None
         i, k = (int(place) for place in rng.integers(first, len(rule), 2))
         if rule[i] == rule[k]:
             return None
@@ -388,7 +383,7 @@ def _used(rules: Mapping[str, tuple[str, ...]]) -> list[str]:
 
 def _cross(rng: np.random.Generator, a: Grammar, b: Grammar) -> Grammar:
     """The rules of either parent; the seed comes with the core's."""
-    givers = {letter: (a, b)[rng.integers(2)] for letter in a.rules}
+    givers = {letter: pick(rng, (a, b)) for letter in a.rules}
     rules = {letter: giver.rules[letter] for letter, giver in givers.items()}
     return Grammar(a.name, rules, givers[CORE].seed)
 

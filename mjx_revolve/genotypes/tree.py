@@ -6,9 +6,9 @@ joint stay with it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import numpy as np
 from annotated_types import Unit
@@ -27,14 +27,12 @@ from mjx_revolve.body.edits import (
 from mjx_revolve.body.module_types import ModuleType, Slot
 from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.body.tree import Morphology
-from mjx_revolve.genotypes.genotype import Genotype, Origins, Space, make_genotype
+from mjx_revolve.genotypes.genotype import Genotype, Origins, Space, make_genotype, pick
 from mjx_revolve.genotypes.growth import Growth, name_place
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.schema import ConstraintError, NonNegative, checked, read
 
 _Rate = Annotated[NonNegative, Unit("-")]
-
-T = TypeVar("T")
 
 
 @checked
@@ -123,11 +121,6 @@ def _try(edit: Callable[..., Morphology | None], *arguments: object) -> Morpholo
         return None
 
 
-def _pick(rng: np.random.Generator, things: Sequence[T]) -> T:
-    """A random one of several things."""
-    return things[int(rng.integers(len(things)))]
-
-
 def _turn(rng: np.random.Generator) -> float:
     return 90.0 * int(rng.integers(4))
 
@@ -150,7 +143,7 @@ def _grow(space: Space, rng: np.random.Generator) -> Morphology:
             and (kind.hinge is not None or missing < size - len(growth.modules))
             and (kind.slots or free)
         ]
-        kind = _pick(rng, kinds or space.kinds)
+        kind = pick(rng, kinds or space.kinds)
         index = growth.attach(parent, slot, kind, _turn(rng))
         if index is not None:
             free += [(index, slot) for slot in kind.slots]
@@ -169,80 +162,67 @@ def _path(body: Morphology, index: int) -> tuple[int, ...]:
     return path
 
 
-def _drawn(rng: np.random.Generator, body: Morphology) -> int | None:
-    """Index of a random module, not the core; None if there is none."""
-    return int(rng.integers(1, body.num_modules)) if body.num_modules > 1 else None
+def _drawn(rng: np.random.Generator, body: Morphology) -> int:
+    """Index of a random module, not the core; raises `InputError` if there is none."""
+    return pick(rng, range(1, body.num_modules))
 
 
 def _add(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology | None:
-    free = free_slots(body)
-    if not free or body.num_modules >= space.max_modules:
+    if body.num_modules >= space.max_modules:
         return None
-    parent, slot = _pick(rng, free)
-    kind = _pick(rng, space.kinds)
+    parent, slot = pick(rng, free_slots(body))
+    kind = pick(rng, space.kinds)
     name = name_place(kind, (*_path(body, parent), slot))
     turn = _turn(rng)
     return add_module(body, parent, slot, kind.name, turn, None, name, space.catalogue)
 
 
-def _delete(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology | None:
+def _delete(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology:
     carriers = {module.parent for module in body.modules}
     leaves = [i for i in range(1, body.num_modules) if i not in carriers]
-    return remove_module(body, _pick(rng, leaves)) if leaves else None
+    return remove_module(body, pick(rng, leaves))
 
 
-def _prune(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology | None:
-    index = _drawn(rng, body)
-    return None if index is None else remove_module(body, index)
+def _prune(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology:
+    return remove_module(body, _drawn(rng, body))
 
 
 def _duplicate(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology | None:
-    index, free = _drawn(rng, body), free_slots(body)
-    if index is None or not free or body.num_modules + _size(body, index) > space.max_modules:
-        return None
-    parent, slot = _pick(rng, free)
-    return graft_subtree(body, parent, slot, body, index)
-
-
-def _swap(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology | None:
-    one, other = _drawn(rng, body), _drawn(rng, body)
-    return None if one is None or other is None else swap_subtrees(body, one, other)
-
-
-def _retype(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology | None:
     index = _drawn(rng, body)
-    if index is None:
+    if body.num_modules + _size(body, index) > space.max_modules:
         return None
+    return graft_subtree(body, *pick(rng, free_slots(body)), body, index)
+
+
+def _swap(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology:
+    return swap_subtrees(body, _drawn(rng, body), _drawn(rng, body))
+
+
+def _retype(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology:
+    index = _drawn(rng, body)
     others = [name for name in space.modules if name != body.modules[index].type]
-    if not others:
-        return None
-    return replace_module(body, index, _pick(rng, others), modules=space.catalogue)
+    return replace_module(body, index, pick(rng, others), modules=space.catalogue)
 
 
-def _turn_one(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology | None:
+def _turn_one(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology:
     index = _drawn(rng, body)
-    if index is None:
-        return None
     turned = body.modules[index].orientation + 90.0 * int(rng.integers(1, 4))
     return turn_module(body, index, turned % 360.0)
 
 
 def _mirror(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology | None:
     index = _drawn(rng, body)
-    if index is None:
+    limb, above = body.modules[index], body.modules[body.modules[index].parent]
+    # At a core, the mirror plane is normal to the slot's direction.
+    away = above.kind.slots[limb.slot].direction if above.kind.mount is None else _side(above.kind)
+    slot = _mirrored_slot(above.kind, limb.slot, away)
+    if slot == limb.slot:
         return None
-    limb = body.modules[index]
-    slot = opposite_slot(body.modules[limb.parent].kind, limb.slot)
-    if slot is None:
-        return None
-    image = mirror_limb(body, index)
-    if image is None:
-        return None
-    parent = body.modules[limb.parent].name
+    image = _mirror_limb(body, index)
     there = [m.name for m in body.modules if (m.parent, m.slot) == (limb.parent, slot)]
     for name in there:
         body = remove_module(body, name)
-    return graft_subtree(body, parent, slot, image, limb.name)
+    return graft_subtree(body, above.name, slot, image, limb.name)
 
 
 _MUTATIONS: dict[str, Callable[[Space, np.random.Generator, Morphology], Morphology | None]] = {
@@ -265,23 +245,7 @@ def _size(body: Morphology, index: int) -> int:
 # ------------------------------------------------------------------------- symmetry
 
 
-def opposite_slot(kind: ModuleType, slot: int) -> int | None:
-    """The slot at the opposite side of a module.
-
-    Args:
-        kind: the module's type.
-        slot: one of its slots.
-
-    Returns:
-        The mirror image of the slot in the upright plane through the module's mount direction (for
-        a core, the plane normal to the slot's direction); None if it has none or is its own.
-    """
-    away = kind.slots[slot].direction if kind.mount is None else _side(kind)
-    found = _mirrored_slot(kind, slot, away)
-    return None if found == slot else found
-
-
-def mirror_limb(body: Morphology, index: int) -> Morphology | None:
+def _mirror_limb(body: Morphology, index: int) -> Morphology:
     """A body with a subtree replaced by its mirror image; only a donor for grafting.
 
     Left and right are exchanged, as seen from the mount: orientations change sign, and slots are
@@ -292,16 +256,17 @@ def mirror_limb(body: Morphology, index: int) -> Morphology | None:
         index: of the subtree's first module, not the core.
 
     Returns:
-        The body, with poses not updated; None if a slot has no mirror image.
+        The body, with poses not updated.
+
+    Raises:
+        InputError: a slot has no mirror image.
     """
     modules = list(body.modules)
     for i in range(index, subtree_end(body.modules, index)):
         module, above = modules[i], body.modules[modules[i].parent]
-        slot: int | None = module.slot
+        slot = module.slot
         if i > index:
-            slot = _mirrored_slot(above.kind, module.slot, _side(above.kind))
-        if slot is None:
-            return None
+            slot = _mirrored_slot(above.kind, slot, _side(above.kind))
         modules[i] = replace(module, slot=slot, orientation=-module.orientation % 360.0)
     return replace(body, modules=tuple(modules))
 
@@ -313,8 +278,12 @@ def _side(kind: ModuleType) -> tuple[float, float, float]:
     return (y, -x, 0.0)
 
 
-def _mirrored_slot(kind: ModuleType, slot: int, away: tuple[float, float, float]) -> int | None:
-    """The slot at the mirror image of another one; `away` is the mirror plane's normal."""
+def _mirrored_slot(kind: ModuleType, slot: int, away: tuple[float, float, float]) -> int:
+    """The slot at the mirror image of another one; `away` is the mirror plane's normal.
+
+    Raises:
+        InputError: there is none.
+    """
     normal = np.array(away)
 
     def image(vector: ArrayLike) -> np.ndarray:
@@ -327,7 +296,7 @@ def _mirrored_slot(kind: ModuleType, slot: int, away: tuple[float, float, float]
     for number, other in kind.slots.items():
         if np.allclose(pose(other, np.array), wanted, atol=1e-9):
             return number
-    return None
+    raise InputError(kind.name, f"a mirror image of slot {slot}", "none")
 
 
 # ------------------------------------------------------------------------- crossover
@@ -338,12 +307,10 @@ def _exchange(
 ) -> Morphology | None:
     """The first body with a subtree of the second in place of one of its own."""
     given = _drawn(rng, b)
-    if given is None:
-        return None
     b = replace(b, modules=tuple(replace(m, origin=(1, m.name)) for m in b.modules))
+    if a.num_modules == 1:
+        return graft_subtree(a, *pick(rng, free_slots(a)), b, given)
     taken = _drawn(rng, a)
-    if taken is None:
-        return graft_subtree(a, *_pick(rng, free_slots(a)), b, given)
     if a.num_modules - _size(a, taken) + _size(b, given) > space.max_modules:
         return None
     old = a.modules[taken]
