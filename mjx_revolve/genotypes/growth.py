@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from mjx_revolve.body.boxes import boxes_overlap
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.placement import GROWN_TOLERANCE, Module, attach, frozen
 from mjx_revolve.body.tree import Morphology
-from mjx_revolve.genotypes.genotype import SLACK, Space
+from mjx_revolve.genotypes.genotype import SLACK, Space, cached
 
 _ORIGIN = frozen(np.zeros(3)), frozen(np.eye(3))
 # By how much boxes have to overlap [m], as in `boxes_overlap`.
@@ -48,9 +49,9 @@ class Growth:
         """
         kind = space.catalogue[space.core]
         core = Module("core", kind.name, -1, -1, 0.0, None, *_ORIGIN, kind)
-        first = seed.modules[0] if seed else core
+        given = seed.modules if seed else (core,)
         self._space = space
-        self._names = {m.name for m in seed.modules} if seed else {core.name}
+        self._names = {module.name for module in given}
         self.modules: list[Module] = []
         self.num_hinges = 0
         self._mass = 0.0
@@ -60,7 +61,7 @@ class Growth:
         self._mains: list[tuple[float, float, float, float, float, float, int, int]] = []
         self._shapes: list[_Shape] = []
         self._low = self._high = [0.0, 0.0, 0.0]
-        self._take(first, (), _shape(_Same(first.kind), first.rotation.tobytes()))
+        self._take(given[0], (), _shapes(given[0].kind)(given[0].rotation.tobytes()))
 
     @property
     def is_full(self) -> bool:
@@ -110,7 +111,7 @@ class Growth:
         if space.max_mass is not None and self._mass + kind.mass > space.max_mass * SLACK:
             return None
         position, rotation = attach(above, above.kind.slots[slot], kind, orientation)
-        shape, place = _shape(_Same(kind), rotation.tobytes()), position.tolist()
+        shape, place = _shapes(kind)(rotation.tobytes()), position.tolist()
         if space.max_length is not None:
             low, high = self._reach(shape, place)
             extent = max(b - a for a, b in zip(low, high, strict=True))
@@ -222,23 +223,14 @@ class _Shape(NamedTuple):
     ways: dict[int, list[float]]
 
 
-class _Same:
-    """A type of module, compared by identity."""
-
-    def __init__(self, kind: ModuleType) -> None:
-        self.kind = kind
-
-    def __hash__(self) -> int:
-        return id(self.kind)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self.kind is other.kind
+@cached
+def _shapes(kind: ModuleType) -> Callable[[bytes], _Shape]:
+    """Rotation → a type's boxes and slots, rotated; cached, as there are few rotations."""
+    return lru_cache(maxsize=4096)(partial(_shape, kind))
 
 
-@lru_cache(maxsize=4096)
-def _shape(same: _Same, turn: bytes) -> _Shape:
-    """A type's boxes and slots, rotated; cached, as there are few rotations."""
-    parts = same.kind.parts
+def _shape(kind: ModuleType, turn: bytes) -> _Shape:
+    parts = kind.parts
     rotation = frozen(np.frombuffer(turn).reshape(3, 3))
     reach = np.abs(rotation).T
     center = np.array([part.position for part in parts])
@@ -248,7 +240,7 @@ def _shape(same: _Same, turn: bytes) -> _Shape:
     middle = np.array([np.add(place, box.position) for place, box in boxes]) @ rotation.T
     whole = np.array([box.size for _, box in boxes]) / 2 @ reach
     mains = zip((center @ rotation.T).tolist(), (half @ reach).tolist(), strict=True)
-    slots = same.kind.slots.items()
+    slots = kind.slots.items()
     return _Shape(
         mains=[*mains],
         half=half,

@@ -66,10 +66,12 @@ def _guard(name: str, genotype: object, space: Space) -> Genotype:
         function, expected = getattr(genotype, what), f"{short_name(name)} to {what}"
         return lambda *given: call_user_function(name, expected, function, *given)
 
-    grow = guarded("develop")
+    functions: dict[str, Any] = {what: guarded(what) for what in genotype._fields if what != "name"}
+    if genotype.adopt is None:
+        functions["adopt"] = None
 
     def develop(genome: object) -> Morphology:
-        body = grow(genome)
+        body = functions["develop"](genome)
         reason: str | None = f"expected a Morphology; found {type(body).__name__}"
         if isinstance(body, Morphology):
             reason = space.refuses(body)
@@ -77,17 +79,7 @@ def _guard(name: str, genotype: object, space: Space) -> Genotype:
             raise InputError(f"{place}: develop: {reason}")
         return body
 
-    return Genotype(
-        name=genotype.name,
-        random=guarded("random"),
-        mutate=guarded("mutate"),
-        cross=guarded("cross"),
-        develop=develop,
-        adopt=None if genotype.adopt is None else guarded("adopt"),
-        to_plain=guarded("to_plain"),
-        from_plain=guarded("from_plain"),
-        settle=guarded("settle"),
-    )
+    return genotype._replace(**functions | {"develop": develop})
 
 
 def _try(name: str, genotype: Genotype) -> None:
