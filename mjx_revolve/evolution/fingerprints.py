@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,17 +79,13 @@ def settings_hash(config: Config, by_path: bool = False, older_world: Collection
     data = plain_settings(config)
     del data["morphology"], data["modules"]
     data["world"]["name"] = Path(data["world"]["name"]).name
-    for name, older in OLDER_WORLD.items():
-        if data["world"].get(name) == (older if name in older_world else getattr(World, name)):
-            del data["world"][name]
+    worlds = {name: getattr(World, name) for name in OLDER_WORLD}
+    _leave_out(data["world"], worlds | {name: OLDER_WORLD[name] for name in older_world})
     data = map_files(data, by_content, Config)
     for section in ("controller", "task"):
-        if not data[section]["params"]:  # older runs have none
-            del data[section]["params"]
+        _leave_out(data[section], {"params": {}})
     for sensor in data["controller"]["sensors"] or ():
-        for key in ("at", "each"):  # older runs lack them
-            if sensor[key] is None:
-                del sensor[key]
+        _leave_out(sensor, {"at": None, "each": None})
     if config.modules is not None:  # types of modules may have sensors of their own
         kinds = {kind.name: kind.sensors for kind in load_modules(config.modules).values()}
         brought = {name: [s.to_mapping() for s in own] for name, own in kinds.items() if own}
@@ -98,20 +94,19 @@ def settings_hash(config: Config, by_path: bool = False, older_world: Collection
     for section, names in _LATER.items():
         fields = type(getattr(config, section)).model_fields
         usual = {name: fields[name].default for name in names}
-        for name, value in (usual | OLDER[section]).items():
-            if data[section][name] == value:
-                del data[section][name]
+        _leave_out(data[section], usual | OLDER[section])
     if (bodies := data["bodies"]) is not None:
-        for part, later in (
-            (bodies, {"max_of": {}, "cloning": 0.0}),
-            (bodies["selection"], {"passport": "made", "reevaluate": False}),
-        ):
-            for name in [name for name, usual in later.items() if part[name] == usual]:
-                del part[name]
-    for name in ("colony", "bodies", "coefficients"):
-        if data[name] is None:
-            del data[name]
+        _leave_out(bodies, {"max_of": {}, "cloning": 0.0})
+        _leave_out(bodies["selection"], {"passport": "made", "reevaluate": False})
+    _leave_out(data, {"colony": None, "bodies": None, "coefficients": None})
     return hash_text(_dump(data))
+
+
+def _leave_out(data: dict[str, Any], older: Mapping[str, object]) -> None:
+    """Removes settings that older runs lack, where they have the values in effect there."""
+    for name, value in older.items():
+        if name in data and data[name] == value:
+            del data[name]
 
 
 def _dump(data: object) -> str:
@@ -153,17 +148,13 @@ def model_hash(fitness: object) -> str:
     return hash_text()
 
 
-def program_versions() -> dict[str, str]:
-    """Our source and the engines' versions, the same in all processes of a run."""
-    versions = {name: installed_version(name) for name in _PACKAGES}
-    return {"mjx_revolve": runtime.source_hash(), **versions}
-
-
 def identify(fitness: object) -> dict[str, Any]:
     """Program, precision, robot and world, which must be equal in all processes of a run."""
     import jax
 
-    return program_versions() | {
+    return {
+        "mjx_revolve": runtime.source_hash(),
+        **{name: installed_version(name) for name in _PACKAGES},
         "precision": str(jax.numpy.zeros(()).dtype),
         "device": jax.default_backend(),
         "robot and world": model_hash(fitness),
