@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 
 from mjx_revolve.inputs.commands import Parser, check_place, program, read_path, run_command
@@ -41,23 +40,15 @@ def main(argv: list[str] | None = None) -> int:
     with opening(arguments.run, trust=arguments.trust):
         folder = find_run(arguments.run)
         champion = RunReader(folder).load_champion()
-        champion.load_config()  # before JAX is imported
+        config = champion.load_config()  # before JAX is imported
         check_place(folder / "any", short_path(folder))
         runtime.prepare_process()
-        return _judge(arguments)
+        from mjx_revolve.episodes.fitness import make_fitness
+        from mjx_revolve.episodes.passport import PASSPORT, make_passport
 
-
-def _judge(arguments: argparse.Namespace) -> int:
-    from mjx_revolve.episodes.fitness import make_fitness
-    from mjx_revolve.episodes.passport import PASSPORT, make_passport
-    from mjx_revolve.episodes.run_reader import RunReader, find_run
-
-    folder = find_run(arguments.run)
-    champion = RunReader(folder).load_champion()
-    config = champion.load_config()
-    fitness = make_fitness(config)
-    champion.check_genes(fitness.num_genes, "config.yaml")
-    passport = make_passport(fitness, champion.genes, config.evolution.seed)
+        fitness = make_fitness(config)
+        champion.check_genes(fitness.num_genes, "config.yaml")
+        passport = make_passport(fitness, champion.genes, config.evolution.seed)
     widths = [max(len(row[k]) for row in passport.rows) for k in range(3)]
     for row in passport.rows:
         *cells, verdict = (*(x.ljust(w) for x, w in zip(row, widths, strict=False)), row[-1])

@@ -11,6 +11,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from mjx_revolve.inputs.commands import Parser, program, run_command
@@ -21,22 +22,9 @@ FOLDER = Path(__file__).with_name("schemas")
 """The schemas of shipped files."""
 
 
-def _config(generate: Generate) -> Schema:
-    from mjx_revolve.episodes.config import Config
-
-    return generate(Config)
-
-
-def _sweep(generate: Generate) -> Schema:
-    from mjx_revolve.evolution.sweeps import Sweep
-
-    return generate(Sweep)
-
-
-def _world(generate: Generate) -> Schema:
-    from mjx_revolve.water.world import World
-
-    return generate(World)
+def _of(name: str) -> Callable[[Generate], Schema]:
+    """A class's schema; the class is imported when it is made."""
+    return lambda generate: generate(resolve_name(f"mjx_revolve.{name}"))
 
 
 def _modules(generate: Generate) -> Schema:
@@ -101,11 +89,11 @@ def _file(keys: Schema, definitions: Schema, required: list[str]) -> Schema:
 
 
 KINDS: dict[str, Callable[[Generate], Schema]] = {
-    "config": _config,
+    "config": _of("episodes.config:Config"),
     "modules": _modules,
     "morphology": _morphology,
-    "sweep": _sweep,
-    "world": _world,
+    "sweep": _of("evolution.sweeps:Sweep"),
+    "world": _of("water.world:World"),
 }
 
 
