@@ -9,10 +9,9 @@ import logging
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from mjx_revolve.evolution.jobs import Job, WorkerError
+from mjx_revolve.evolution.jobs import MakeFitness, WorkerError, make_job
 from mjx_revolve.inputs.errors import InputError
 
 if TYPE_CHECKING:
@@ -137,12 +136,7 @@ class Executor:
     def __enter__(self) -> Executor:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -158,15 +152,29 @@ class WorkerExecutor(Executor, ABC, Generic[AnyWorker]):
             `fingerprints.identify`.
     """
 
-    def __init__(self, config: Config, job: Job) -> None:
-        """Makes this process's own fitness, while the workers make theirs."""
+    def __init__(self, config: Config, make_fitness: MakeFitness | None) -> None:
+        """Makes this process's own fitness, while the workers make theirs.
+
+        Args:
+            config: of the run.
+            make_fitness: see `executor.make_executor`.
+        """
         from mjx_revolve.evolution.blocks import choose_block
         from mjx_revolve.evolution.fingerprints import identify
 
-        self.job = job
-        fitness = job.make_fitness(config)
-        super().__init__(fitness, choose_block(fitness) or config.evolution.population_size)
-        self.identity = identify(fitness)
+        try:
+            self.job = make_job(config, make_fitness)
+            self.begin()
+            fitness = self.job.make_fitness(config)
+            super().__init__(fitness, choose_block(fitness) or config.evolution.population_size)
+            self.identity = identify(fitness)
+        except BaseException:
+            self.close()
+            raise
+
+    @abstractmethod
+    def begin(self) -> None:
+        """Gives the workers their job."""
 
     @abstractmethod
     def free(self) -> list[AnyWorker]:

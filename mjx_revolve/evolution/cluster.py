@@ -33,7 +33,6 @@ from mjx_revolve.evolution.jobs import (
     WorkerError,
     compile_job,
     describe_error,
-    make_job,
     open_job,
 )
 from mjx_revolve.inputs.errors import InputError
@@ -170,13 +169,11 @@ class ClusterExecutor(WorkerExecutor[ClusterWorker]):
         self._next_look = 0.0
         self._at_once = _AT_ONCE
         self._deserted = False
-        try:
-            job = make_job(config, make_fitness)
-            self._pickled = pickle.dumps(job)
-            super().__init__(config, job)
-        except BaseException:
-            self.close()
-            raise
+        super().__init__(config, make_fitness)
+
+    def begin(self) -> None:
+        """See `WorkerExecutor`; they fetch it with their first task."""
+        self._pickled = pickle.dumps(self.job)
 
     @property
     def num_workers(self) -> int:

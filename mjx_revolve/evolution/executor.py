@@ -82,7 +82,14 @@ def make_executor(
 
         fitness = (make_fitness or choose_fitness(config))(config)
         return Executor(fitness, choose_block(fitness))
-    _expect_cpu("--cluster" if cluster else "--workers")
+    if not on_cpu():
+        import jax
+
+        raise InputError(
+            f"{'--cluster' if cluster else '--workers'}: expected JAX to run on the CPU "
+            "(JAX_PLATFORMS=cpu), where work is spread over cores; found "
+            f"{jax.default_backend()}, which takes the whole population"
+        )
     if cluster:
         from mjx_revolve.evolution.cluster import ClusterExecutor
 
@@ -90,13 +97,3 @@ def make_executor(
     from mjx_revolve.evolution.processes import ProcessExecutor, start_workers
 
     return ProcessExecutor(config, make_fitness, started or start_workers(workers, cache), cache)
-
-
-def _expect_cpu(option: str) -> None:
-    import jax
-
-    if jax.default_backend() != "cpu":
-        raise InputError(
-            f"{option}: expected JAX to run on the CPU (JAX_PLATFORMS=cpu), where work is spread "
-            f"over cores; found {jax.default_backend()}, which takes the whole population"
-        )

@@ -32,7 +32,6 @@ from mjx_revolve.evolution.jobs import (
     WorkerError,
     compile_job,
     describe_error,
-    make_job,
     open_job,
 )
 from mjx_revolve.numerics import runtime
@@ -159,8 +158,7 @@ class LocalWorker:
                 return f"killed by {signal.Signals(-code).name}"
         self._log.seek(0, os.SEEK_END)
         self._log.seek(max(0, self._log.tell() - _TAIL))
-        lines = self._log.read().decode(errors="replace").split("\n")
-        words = next((line.strip() for line in reversed(lines) if line.strip()), "")
+        words = self._log.read().decode(errors="replace").strip().split("\n")[-1].strip()
         return f"exit code {code}" + (f": {words}" if words else "")
 
     def end(self) -> None:
@@ -230,14 +228,12 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
         self._cache = cache
         self._times: deque[float] = deque(maxlen=101)
         self._false_starts = 0
-        try:
-            job = make_job(config, make_fitness)
-            for worker in self.workers:
-                worker.send((job, self._scratch.name))
-            super().__init__(config, job)
-        except BaseException:
-            self.close()
-            raise
+        super().__init__(config, make_fitness)
+
+    def begin(self) -> None:
+        """See `WorkerExecutor`."""
+        for worker in self.workers:
+            worker.send((self.job, self._scratch.name))
 
     @property
     def num_workers(self) -> int:
