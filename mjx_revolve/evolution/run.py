@@ -166,65 +166,53 @@ class Run:
                 run.
             WorkerError: workers cannot be started.
         """
-        files = open_run_folder(folder)
-        try:
-            return cls._reopen(files, f"--resume {folder}", path, settings, make_executor)
-        except BaseException:
-            files.abandon()
-            raise
-
-    @classmethod
-    def _reopen(
-        cls,
-        files: RunFolder,
-        label: str,
-        path: str | None,
-        settings: Sequence[str],
-        make_executor: MakeExecutor,
-    ) -> Run:
-        """A run of a folder that is locked; see `resume`."""
-        old = files.load_config()
-        earlier = files.info.get("settings", [])
-        if path is None:
-            config = override_config(old, settings)
-        else:
-            config = load_config(path, [*earlier, *settings])
-        check_unchanged(old, config, label)
-        free = {key: getattr(config.evolution, key) for key in FREE_SETTINGS}
-        config = old.model_copy(update={"evolution": old.evolution.model_copy(update=free)})
-        if config.evolution.tensorboard:
-            check_tensorboard(label)
-        checkpoint = files.load_checkpoint() if files.checkpoints() else None
-        for name in checkpoint.damaged if checkpoint else ():
-            _log.warning("passed over a damaged checkpoint: %s", name)
-        begun = checkpoint.meta if checkpoint else files.info
-        settled = settings_hash(config)
-        known = begun.get("settings_hash", settled)  # an older version's run.json has none
-        worlds = [(), *((name,) for name in OLDER_WORLD), tuple(OLDER_WORLD)]
-        ways = itertools.product((False, True), worlds)
-        if known not in {settings_hash(config, *way) for way in ways}:
-            raise InputError(label, "the config.yaml that it began with", "it changed")
-        executor = _prepare(config, make_executor)
-        if begun.get("model_hash") != model_hash(executor.fitness):
-            raise InputError(
-                f"{label}: expected the robot and the world that it began with; found them changed "
-                "(a file that config.yaml names, or the program)"
-            )
-        if checkpoint is None and files.champion_path:
-            # A champion is written after a checkpoint: all of them are lost, which this says.
-            files.load_checkpoint()
-        files.update_info(settings=[*earlier, *_portable(settings, config)])
-        run = cls(files, config, executor, make_evolution(config, executor), resumed=True)
-        if checkpoint is not None:
-            if found := _differences(checkpoint.meta.get("host"), describe_host()):
-                _log.warning(
-                    "the run continues, but not bit for bit, because this process differs: %s",
-                    "; ".join(found),
+        label = f"--resume {folder}"
+        with contextlib.ExitStack() as failed:
+            files = open_run_folder(folder)
+            failed.callback(files.abandon)
+            old = files.load_config()
+            earlier = files.info.get("settings", [])
+            if path is None:
+                config = override_config(old, settings)
+            else:
+                config = load_config(path, [*earlier, *settings])
+            check_unchanged(old, config, label)
+            free = {key: getattr(config.evolution, key) for key in FREE_SETTINGS}
+            config = old.model_copy(update={"evolution": old.evolution.model_copy(update=free)})
+            if config.evolution.tensorboard:
+                check_tensorboard(label)
+            checkpoint = files.load_checkpoint() if files.checkpoints() else None
+            for name in checkpoint.damaged if checkpoint else ():
+                _log.warning("passed over a damaged checkpoint: %s", name)
+            begun = checkpoint.meta if checkpoint else files.info
+            settled = settings_hash(config)
+            known = begun.get("settings_hash", settled)  # an older version's run.json has none
+            worlds = [(), *((name,) for name in OLDER_WORLD), tuple(OLDER_WORLD)]
+            ways = itertools.product((False, True), worlds)
+            if known not in {settings_hash(config, *way) for way in ways}:
+                raise InputError(label, "the config.yaml that it began with", "it changed")
+            executor = _prepare(config, make_executor)
+            if begun.get("model_hash") != model_hash(executor.fitness):
+                raise InputError(
+                    f"{label}: expected the robot and the world that it began with; found them "
+                    "changed (a file that config.yaml names, or the program)"
                 )
-            with reading(checkpoint.path):
-                run.search = run.evolution.from_arrays(checkpoint.arrays)
-            run.checkpoint = checkpoint
-        return run
+            if checkpoint is None and files.champion_path:
+                # A champion is written after a checkpoint: all of them are lost, which this says.
+                files.load_checkpoint()
+            files.update_info(settings=[*earlier, *_portable(settings, config)])
+            run = cls(files, config, executor, make_evolution(config, executor), resumed=True)
+            if checkpoint is not None:
+                if found := _differences(checkpoint.meta.get("host"), describe_host()):
+                    _log.warning(
+                        "the run continues, but not bit for bit, because this process differs: %s",
+                        "; ".join(found),
+                    )
+                with reading(checkpoint.path):
+                    run.search = run.evolution.from_arrays(checkpoint.arrays)
+                run.checkpoint = checkpoint
+            failed.pop_all()
+            return run
 
     # --- generations ---
 

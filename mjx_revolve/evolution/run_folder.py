@@ -193,19 +193,17 @@ class RunFolder(RunReader):
         Args:
             checkpoint: the checkpoint; None: the run's beginning.
         """
-        if checkpoint is None:
-            for name in ("metrics.csv", *LOGS):
-                (self.path / name).unlink(missing_ok=True)
-        else:
-            for name in ("metrics.csv", *LOGS):
-                if (self.path / name).exists():
-                    os.truncate(self.path / name, checkpoint.positions.get(name, 0))
-            for path in self.checkpoints():
-                if generation_of(path) > checkpoint.meta["generation"]:
-                    path.unlink(missing_ok=True)
-        for path in self.path.rglob(".*"):
-            if _TEMPORARY.match(path.name):
-                path.unlink(missing_ok=True)
+        later = [path for path in self.path.rglob(".*") if _TEMPORARY.match(path.name)]
+        for log in (self.path / name for name in ("metrics.csv", *LOGS)):
+            if checkpoint is None:
+                later.append(log)
+            elif log.exists():
+                os.truncate(log, checkpoint.positions.get(log.name, 0))
+        if checkpoint is not None:
+            newest = checkpoint.meta["generation"]
+            later += [path for path in self.checkpoints() if generation_of(path) > newest]
+        for path in later:
+            path.unlink(missing_ok=True)
 
     # --- champion ---
 
@@ -302,24 +300,17 @@ def is_new_folder(folder: Path) -> bool:
     return not names or (begun and names <= _BEGINNING)
 
 
-def check_new_folder(folder: str | Path, option: str = "--out") -> None:
+def check_new_folder(folder: str | Path) -> None:
     """Refuses a folder that holds something.
-
-    Args:
-        folder: where a new run is to go.
-        option: what messages call it.
 
     Raises:
         InputError: there is a file, or a folder that is not empty.
     """
     folder = Path(folder)
-    if is_new_folder(folder):
-        return
-    if folder.is_dir():
+    if folder.exists() and not is_new_folder(folder):
         hint = "; continue it with --resume" if (folder / "run.json").exists() else ""
-        raise InputError(f"{option} {folder}", "a new or empty folder", f"files{hint}")
-    if folder.exists():
-        raise InputError(f"{option} {folder}", "a new or empty folder", "a file")
+        found = f"files{hint}" if folder.is_dir() else "a file"
+        raise InputError(f"--out {folder}", "a new or empty folder", found)
 
 
 def create_run_folder(

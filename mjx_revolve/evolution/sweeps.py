@@ -107,19 +107,15 @@ def next_step(plan: Plan) -> Step:
     """
     folder, wanted = plan.folder, plan.config
     label = short_path(folder)
-    if not folder.is_dir() or not any(folder.iterdir()):
-        if folder.exists() and not folder.is_dir():
-            raise InputError(label, "a run folder", "a file")
+    if folder.exists() and not folder.is_dir():
+        raise InputError(label, "a run folder", "a file")
+    # A new one may be of a process that was killed while it made the folder.
+    if not folder.exists() or (not (folder / "config.yaml").exists() and is_new_folder(folder)):
         return "begin"
-    if not (folder / "config.yaml").exists() and is_new_folder(folder):
-        return "begin"  # killed while its folder was made
-    run = open_run_folder(folder)
-    try:
+    with contextlib.closing(open_run_folder(folder)) as run:
         check_unchanged(run.load_config(), wanted, label)
         found, length = _generations(run), wanted.evolution.generations
         finished = "finished" in run.info
-    finally:
-        run.close()
     if found > length:
         raise InputError(
             label, f"a run of {length} generations at most", f"{found} (choose another --out)"
