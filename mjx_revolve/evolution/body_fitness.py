@@ -106,15 +106,9 @@ class BodyFitness:
     @cached_property
     def identity(self) -> str:
         """Fingerprint of the world and the types of modules, on which scores depend."""
-        kinds = [repr(kind) for kind in self.module_types.values()]
-        return "\n".join([repr(self.mixed.world), *kinds, *(repr(s.modules) for s in self.seeds)])
-
-    @cached_property
-    def module_types(self) -> Mapping[str, ModuleType]:
-        """Types of modules that bodies are grown of."""
         modules = read_modules(self.config)
-        names = (self.bodies.core, *self.bodies.modules)
-        return {name: modules[name] for name in names}
+        kinds = [repr(modules[name]) for name in (self.bodies.core, *self.bodies.modules)]
+        return "\n".join([repr(self.mixed.world), *kinds, *(repr(s.modules) for s in self.seeds)])
 
     @property
     def measure_names(self) -> tuple[str, ...]:
@@ -192,8 +186,11 @@ def make_body_fitness(config: Config) -> BodyFitness:
         space = make_space(bodies, modules, _bound_of_trim(config))
         seeds = tuple(_load_seed(path, modules, config, space) for path in bodies.seeds)
         genotype = find_genotype(bodies.genotype, space, bodies.params, config.source)
-        _check_seeds(bodies, genotype)
-        examples = [*seeds, *_examples(genotype)]
+        if seeds and genotype.adopt is None:
+            none = f"none, as no {bodies.name} grows into a given robot"
+            raise InputError("bodies.seeds", none, len(seeds))
+        rng = np.random.default_rng(0)  # so that they are the same in all processes
+        examples = [*seeds, *(genotype.develop(genotype.random(rng)) for _ in range(_EXAMPLES))]
         kinds = [modules[name] for name in (bodies.core, *bodies.modules)]
         mixed = make_mixed_fitness(
             config, examples, bodies.max_hinges, modules=bodies.max_modules, kinds=kinds
@@ -217,12 +214,6 @@ def _ask_for_measures(config: Config) -> Config:
     wanted = tuple(dict.fromkeys((*config.task.measures, *extra)))
     task = config.task.model_copy(update={"measures": wanted})
     return config.model_copy(update={"task": task})
-
-
-def _examples(genotype: Genotype) -> list[Morphology]:
-    """Random bodies, the same in all processes."""
-    rng = np.random.default_rng(0)
-    return [genotype.develop(genotype.random(rng)) for _ in range(_EXAMPLES)]
 
 
 def _bound_of_trim(config: Config) -> Callable[[Morphology], bool]:
@@ -249,10 +240,3 @@ def _load_seed(
     if reason:
         raise InputError(f"bodies.seeds: {path}: {reason}")
     return body
-
-
-def _check_seeds(bodies: BodiesConfig, genotype: Genotype) -> None:
-    if bodies.seeds and genotype.adopt is None:
-        raise InputError(
-            "bodies.seeds", f"none, as no {bodies.name} grows into a given robot", len(bodies.seeds)
-        )

@@ -96,7 +96,7 @@ class ColonyEvolution(IndividualEvolution):
 
     def ask(self, search: Colony) -> ColonyInterval:
         """The next interval: the tank as it was, founders in the first one, and signals."""
-        if search.tank is not self._held and (search.tank or self._held != {}):
+        if search.tank is not self._held:
             self._load(search)
         generation = search.generation + 1
         rng = np.random.default_rng([self.config.evolution.seed, generation])
@@ -148,11 +148,10 @@ class ColonyEvolution(IndividualEvolution):
         """Restores the tank of a colony."""
         if self._held != {}:
             self._empty_tank()
-        if not search.tank:
-            return
-        members = search.members.values()
-        robots = {m.slot: self.fitness.build(m.individual.body) for m in members}
-        self.tank.from_arrays(search.tank, robots)
+        if search.tank:
+            members = search.members.values()
+            robots = {m.slot: self.fitness.build(m.individual.body) for m in members}
+            self.tank.from_arrays(search.tank, robots)
 
     def _synchronize(self, before: Colony, after: Colony, shift: np.ndarray | None = None) -> None:
         """Brings the tank's robots from one state of the colony to the next."""

@@ -193,17 +193,16 @@ class GeneEvolution:
         misled by noise is at least no worse than that. Where a passport is required, the first of
         the best few that passes.
         """
-        candidates = [*search.elites, search.latest]
         origins = [f"best of generation {g}" for g in search.elite_generations]
-        origins.append("best of the last generation")
+        candidates = [*zip(origins, search.elites, strict=True)]
+        candidates.append(("best of the last generation", search.latest))
         mean = self.strategy.mean(search.state)
         if mean is not None and np.isfinite(mean).all():
-            candidates.append(mean)
-            origins.append("mean of the last distribution")
+            candidates.append(("mean of the last distribution", mean))
         # Last, so that evolved genes win a tie.
-        candidates.append(np.zeros(self.executor.num_genes))
-        origins.append("zero genes: nothing that evolved is better")
-        genes = np.stack(candidates).astype(np.float32)
+        zero = np.zeros(self.executor.num_genes)
+        candidates.append(("zero genes: nothing that evolved is better", zero))
+        genes = np.stack([found for _, found in candidates]).astype(np.float32)
         # Empty places among the elites hold zero genes and must not win.
         eligible = np.ones(len(genes), bool)
         eligible[: len(search.elite_scores)] = np.isfinite(search.elite_scores)
@@ -224,7 +223,7 @@ class GeneEvolution:
         winner, found = choose_candidate(
             score, eligible, self.config.seed, judge if required else None
         )
-        return Champion(genes=genes[winner], origin=origins[winner], **found)
+        return Champion(genes=genes[winner], origin=candidates[winner][0], **found)
 
     # --- to and from a checkpoint
 

@@ -28,6 +28,15 @@ CHOOSE_EPISODES = 8
 _TRIED = 8
 # A stream of random numbers that no generation uses.
 CHOOSE_STREAM = 2**32 - 1
+# Columns of a generation's row that describe its finite scores.
+_STATISTICS: dict[str, Callable[[np.ndarray], float]] = {
+    "best": np.max,
+    "mean": np.mean,
+    "std": np.std,
+    "median": np.median,
+    "lower_quartile": lambda scores: np.quantile(scores, 0.25),
+    "upper_quartile": lambda scores: np.quantile(scores, 0.75),
+}
 
 
 @dataclass(frozen=True)
@@ -177,17 +186,7 @@ def run_generations(
 def score_statistics(scores: np.ndarray) -> dict[str, float]:
     """Best, mean, std, median and quartiles of the finite scores among `[P]`; NaN without any."""
     finite = scores[np.isfinite(scores)].astype(np.float64)
-    if not finite.size:
-        names = ("best", "mean", "std", "median", "lower_quartile", "upper_quartile")
-        return dict.fromkeys(names, float("nan"))
-    return {
-        "best": float(finite.max()),
-        "mean": float(finite.mean()),
-        "std": float(finite.std()),
-        "median": float(np.median(finite)),
-        "lower_quartile": float(np.quantile(finite, 0.25)),
-        "upper_quartile": float(np.quantile(finite, 0.75)),
-    }
+    return {n: float(of(finite)) if finite.size else np.nan for n, of in _STATISTICS.items()}
 
 
 def choose_candidate(

@@ -15,7 +15,7 @@ from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.evolution.blocks import Scored
 from mjx_revolve.evolution.body_fitness import BodyFitness
 from mjx_revolve.evolution.executor import Executor
-from mjx_revolve.evolution.generations import Champion, choose_candidate
+from mjx_revolve.evolution.generations import Champion, SearchState, choose_candidate
 from mjx_revolve.evolution.individuals import Individual, best_individuals
 from mjx_revolve.evolution.learning import learnt_genes, score_brains
 from mjx_revolve.inputs.errors import InputError
@@ -27,12 +27,8 @@ MEAN_DESCRIPTORS = ("num_modules", "num_hinges", "length", "mass", "branching", 
 _CANDIDATES = 64
 
 
-class IndividualSearch(Protocol):
+class IndividualSearch(SearchState, Protocol):
     """State of a search over individuals."""
-
-    @property
-    def generation(self) -> int:
-        """Number of finished generations."""
 
     @property
     def elites(self) -> tuple[Individual, ...]:

@@ -113,8 +113,7 @@ class Interrupts:
                 self.rescue()
             except Exception as error:  # a full disk, say: the checkpoint before stays whole
                 words = f"not saved: {' '.join(str(error).split())}"
-            if words:
-                _say(words)
+            _say(words)
             os._exit(128 + number)
 
     @property

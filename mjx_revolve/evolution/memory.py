@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import contextlib
 from pathlib import Path
 
 from mjx_revolve.episodes.config import Config
@@ -60,18 +61,14 @@ def free_memory(root: Path = Path("/")) -> int | None:
         The smaller one; None where neither is known.
     """
     found = []
-    try:
+    with contextlib.suppress(OSError, ValueError):
         for line in (root / "proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
                 found.append(1024 * int(line.split()[1]))
-    except (OSError, ValueError):
-        pass
-    try:
+    with contextlib.suppress(OSError, ValueError):  # no container, or one without a limit ("max")
         limit, used = (
             int((root / "sys/fs/cgroup" / name).read_text(encoding="ascii"))
             for name in ("memory.max", "memory.current")
         )
         found.append(max(0, limit - used))
-    except (OSError, ValueError):  # no container, or one without a limit ("max")
-        pass
     return min(found, default=None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import os
 import sys
 import time
@@ -64,12 +65,8 @@ def is_live(out: TextIO) -> bool:
 
 def choose_stride(total: int) -> int:
     """Generations between two plain lines: 1, 2, 5, 10, 20, 50 ..., for at most 60 lines."""
-    stride, factors = 1, (2.0, 2.5, 2.0)
-    count = 0
-    while total / stride > _LINES:
-        stride = round(stride * factors[count % 3])
-        count += 1
-    return stride
+    strides = (digit * 10**power for power in itertools.count() for digit in (1, 2, 5))
+    return next(stride for stride in strides if total / stride <= _LINES)
 
 
 class Progress:
@@ -125,8 +122,22 @@ class Progress:
             row: its figures: generation, best, mean, evaluations_per_second, and failed where
                 there is such a column; a colony's: living, time [s] and times_real_time, too.
         """
+        generation = int(row["generation"])
         with self._forgiving():
-            self._show(row)
+            self._bar.ncols = self._columns()
+            self._bar.figures = self._figures(row)
+            self._bar.words = ""
+            first, self._first = self._first, False
+            if first:  # mostly compilation: the time left is estimated from later ones
+                self._bar.unpause()
+                self._bar.n = self._bar.initial = self._bar.last_print_n = generation
+                self._bar.refresh()
+            else:
+                self._bar.update(generation - self._bar.n)
+            last = generation >= self._total
+            overdue = time.monotonic() - self._written > _LONGEST_GAP
+            if first or last or overdue or generation % self._stride == 0:
+                self._write()
 
     def say(self, words: str) -> None:
         """Shows the activity after the last generation."""
@@ -148,23 +159,6 @@ class Progress:
         except OSError:
             self._live, self._bar.disable = False, True
             self._plain = None if self._leave else self._plain
-
-    def _show(self, row: Mapping[str, float]) -> None:
-        generation = int(row["generation"])
-        self._bar.ncols = self._columns()
-        self._bar.figures = self._figures(row)
-        self._bar.words = ""
-        first, self._first = self._first, False
-        if first:  # mostly compilation: the time left is estimated from later ones
-            self._bar.unpause()
-            self._bar.n = self._bar.initial = self._bar.last_print_n = generation
-            self._bar.refresh()
-        else:
-            self._bar.update(generation - self._bar.n)
-        last = generation >= self._total
-        overdue = time.monotonic() - self._written > _LONGEST_GAP
-        if first or last or overdue or generation % self._stride == 0:
-            self._write()
 
     def _write(self) -> None:
         """A plain line."""
