@@ -159,9 +159,8 @@ class ClusterExecutor(WorkerExecutor[ClusterWorker]):
             where = {"scheduler_file" if is_file else "address": place}
             self._client = distributed.Client(**where, set_as_default=False)
         except Exception as error:  # Dask raises anything about addresses, files and TLS
-            raise InputError(
-                f"--cluster {place}", "a Dask scheduler", describe_error(error)
-            ) from None
+            found = describe_error(error)
+            raise InputError(f"--cluster {place}", "a Dask scheduler", found) from None
         self.place = place
         self.workers: dict[str, ClusterWorker] = {}
         self._facts: dict[str, set[str]] = {}

@@ -196,11 +196,10 @@ def make_rules(fitness: BodyFitness) -> Rules:
     if world.bed is not None:
         bed = highest_bed(world.bed, colony.arena.size / 2)
         if rules.birth_height <= bed:
-            raise InputError(
-                f"{fitness.config.origin('task.depth')}task.depth: expected less than "
-                f"{rules.surface - bed:g} m, the least depth of the bed in the arena, as robots of "
-                f"a colony are born at this depth; found {fitness.config.task.depth:g}"
-            )
+            place = f"{fitness.config.origin('task.depth')}task.depth"
+            most = f"less than {rules.surface - bed:g} m, the least depth of the bed in the arena"
+            why = "as robots of a colony are born at this depth"
+            raise InputError(place, f"{most}, {why}", f"{fitness.config.task.depth:g}")
     return rules
 
 

@@ -85,11 +85,9 @@ def make_executor(
     if not on_cpu():
         import jax
 
-        raise InputError(
-            f"{'--cluster' if cluster else '--workers'}: expected JAX to run on the CPU "
-            "(JAX_PLATFORMS=cpu), where work is spread over cores; found "
-            f"{jax.default_backend()}, which takes the whole population"
-        )
+        cpu = "JAX to run on the CPU (JAX_PLATFORMS=cpu), where work is spread over cores"
+        found = f"{jax.default_backend()}, which takes the whole population"
+        raise InputError("--cluster" if cluster else "--workers", cpu, found)
     if cluster:
         from mjx_revolve.evolution.cluster import ClusterExecutor
 

@@ -158,9 +158,8 @@ def from_record(
         raise InputError("individual", "a record of one", show(error)) from None
     grown = genotype.develop(genome)
     if grown.modules != found.body.modules:
-        raise InputError(
-            f"individual {found.number}", "the body that its genome grows into", "another one"
-        )
+        own = "the body that its genome grows into"
+        raise InputError(f"individual {found.number}", own, "another one")
     return replace(found, body=grown)
 
 

@@ -45,10 +45,8 @@ def check_memory(config: Config, num_genes: int) -> None:
 
         if free is not None and need(found) > free:
             most = max(0, bisect.bisect_right(range(found), free, key=need) - 1)
-            raise InputError(
-                f"{config.origin(place)}{place}: expected at most {most}, as {free / 1e9:.3g} GB "
-                f"of memory are free; found {found}"
-            )
+            fits = f"at most {most}, as {free / 1e9:.3g} GB of memory are free"
+            raise InputError(f"{config.origin(place)}{place}", fits, found)
 
 
 def free_memory(root: Path = Path("/")) -> int | None:

@@ -250,7 +250,5 @@ def check_selection(settings: SelectionConfig, mu: int) -> None:
         raise InputError("bodies.selection.elites", f"less than {size}", elites)
     if settings.type in ("comma", "generational") and children < mu - elites:
         least = f"at least {size}" + f" - elites ({elites})" * (elites > 0)
-        raise InputError(
-            f"bodies.selection.offspring: expected {least}, as {settings.type} keeps no other "
-            f"parents; found {children}"
-        )
+        enough = f"{least}, as {settings.type} keeps no other parents"
+        raise InputError("bodies.selection.offspring", enough, children)

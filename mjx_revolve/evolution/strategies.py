@@ -292,9 +292,8 @@ def _make_strategy(
             raise InputError(f"evolution.strategy_params.{key}", "a number > 0", repr(value))
     keywords, used = _constructor_settings(name, settings, std_init, size, num_genes)
     if name == "LM_MA_ES" and size > 2 * num_genes:  # beyond, its first c_c > 2: a negative root
-        raise InputError(
-            "evolution.population_size", f"at most twice the {num_genes} genes for {name}", size
-        )
+        most = f"at most twice the {num_genes} genes for {name}"
+        raise InputError("evolution.population_size", most, size)
     try:
         algorithm = _strategies()[name](
             population_size=size, solution=jnp.zeros(num_genes), **keywords
@@ -314,18 +313,11 @@ def _make_strategy(
         if key == "std_init":
             raise InputError("evolution.strategy_params.std_init", "evolution.std_init", "it here")
         if key not in free:
-            names = ", ".join(free) or "none at all"
-            raise InputError(
-                f"evolution.strategy_params.{key}", f"one of {names} for {name}", "an unknown name"
-            )
+            known = f"one of {', '.join(free) or 'none at all'} for {name}"
+            raise InputError(f"evolution.strategy_params.{key}", known, "an unknown name")
         params = params.replace(**{key: _as_param(key, value, getattr(params, key))})
-    return Strategy(
-        name=name,
-        algorithm=algorithm,
-        params=params,
-        std_init=std_init,
-        population_based=name not in distribution_based_algorithms,
-    )
+    population_based = name not in distribution_based_algorithms
+    return Strategy(name, algorithm, params, std_init, population_based)
 
 
 def _as_param(key: str, value: object, default: jax.Array) -> jax.Array:

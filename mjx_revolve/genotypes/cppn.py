@@ -351,9 +351,8 @@ class _Plain:
         numbers = [number for number, _ in self.nodes]
         for k, (number, function) in enumerate(self.nodes):
             if function not in FUNCTIONS:
-                raise ConstraintError(
-                    f"nodes.{k}.1", f"one of {', '.join(FUNCTIONS)}", repr(function)
-                )
+                names = f"one of {', '.join(FUNCTIONS)}"
+                raise ConstraintError(f"nodes.{k}.1", names, repr(function))
             if number < self.num_outputs or number in numbers[:k]:
                 least = f"a number >= {self.num_outputs} that no other node has"
                 raise ConstraintError(f"nodes.{k}.0", least, str(number))
@@ -375,9 +374,6 @@ def read_cppn(plain: object) -> CPPN:
         InputError: it is no network.
     """
     found = read(_Plain, plain, "genome")
-    return CPPN(
-        num_inputs=found.num_inputs,
-        num_outputs=found.num_outputs,
-        nodes=tuple(Node(*node) for node in found.nodes),
-        links=tuple(Connection(*link) for link in found.links),
-    )
+    nodes = tuple(Node(*node) for node in found.nodes)
+    links = tuple(Connection(*link) for link in found.links)
+    return CPPN(found.num_inputs, found.num_outputs, nodes, links)

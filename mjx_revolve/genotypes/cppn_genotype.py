@@ -57,10 +57,8 @@ def make_cppn(space: Space, params: Mapping[str, object], place: str) -> Genotyp
         network = read_cppn(plain)
         found = (network.num_inputs, network.num_outputs)
         if found != (_INPUTS, outputs):
-            raise InputError(
-                f"genome: expected {_INPUTS} inputs and {outputs} outputs, for {outputs - 2} types "
-                f"of modules; found {found[0]} and {found[1]}"
-            )
+            ends = f"{_INPUTS} inputs and {outputs} outputs, for {outputs - 2} types of modules"
+            raise InputError("genome", ends, f"{found[0]} and {found[1]}")
         return network
 
     return make_genotype(

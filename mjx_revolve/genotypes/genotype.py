@@ -164,22 +164,16 @@ def make_space(
             known = ", ".join(names)
             raise InputError("bodies.max_of", f"any of bodies.modules, {known}", name)
     if bodies.min_hinges > 0 and all(catalogue[name].hinge is None for name in names):
-        raise InputError(
-            f"bodies.modules: expected a type with a hinge, since min_hinges is "
-            f"{bodies.min_hinges}; found {', '.join(names)}"
-        )
+        hinged = f"a type with a hinge, since min_hinges is {bodies.min_hinges}"
+        raise InputError("bodies.modules", hinged, ", ".join(names))
+    bounds = ("min_modules", "max_modules", "min_hinges", "max_hinges", "max_length", "max_mass")
     return Space(
         catalogue=catalogue,
         modules=tuple(names),
         core=find("core", bodies.core, True),
-        min_modules=bodies.min_modules,
-        max_modules=bodies.max_modules,
-        min_hinges=bodies.min_hinges,
-        max_hinges=bodies.max_hinges,
-        max_length=bodies.max_length,
-        max_mass=bodies.max_mass,
         max_of=max_of,
         accepts=accepts,
+        **{name: getattr(bodies, name) for name in bounds},
     )
 
 
@@ -224,10 +218,8 @@ def make_genotype(
             reason = space.refuses(develop(genome))
             if reason is None:
                 return genome
-        raise InputError(
-            f"{place}: expected bounds that random bodies can keep; found none of {_RANDOM_TRIES} "
-            f"that does (the last: {reason})"
-        )
+        found = f"none of {_RANDOM_TRIES} that does (the last: {reason})"
+        raise InputError(place, "bounds that random bodies can keep", found)
 
     def within(vary: Callable[..., G | None]) -> Callable[..., G]:
         """The first variation that is in the space, or the first parent."""

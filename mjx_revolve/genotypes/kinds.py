@@ -43,15 +43,12 @@ def find_genotype(
         make = getattr(import_module(f"mjx_revolve.genotypes.{module}"), function)
         return make(space, params, f"{source}: bodies")
     if parse_user_function(name) is None:
-        known = ", ".join(GENOTYPES)
-        raise InputError(
-            f"{source}: bodies.genotype", f"one of {known}, or FILE.py:FUNCTION", repr(name)
-        )
+        known = f"one of {', '.join(GENOTYPES)}, or FILE.py:FUNCTION"
+        raise InputError(f"{source}: bodies.genotype", known, repr(name))
     function = load_user_function(name, f"{source}: bodies.genotype")
     expected = f"{short_name(name)} to make a genotype"
-    genotype = _guard(
-        name, call_user_function(name, expected, function, space, dict(params)), space
-    )
+    made = call_user_function(name, expected, function, space, dict(params))
+    genotype = _guard(name, made, space)
     _try(name, genotype)
     return genotype
 
@@ -96,7 +93,5 @@ def _try(name: str, genotype: Genotype) -> None:
             f"{place}: to_plain: expected what JSON can hold; found: {found}"
         ) from None
     if genotype.develop(genotype.from_plain(json.loads(text))) != body:
-        raise InputError(
-            f"{place}: to_plain, from_plain: expected a genome that JSON gives back; found one "
-            "that grows another body"
-        )
+        same = "a genome that JSON gives back"
+        raise InputError(f"{place}: to_plain, from_plain", same, "one that grows another body")

@@ -182,10 +182,8 @@ def make_alphabet(space: Space, upright: bool = True) -> dict[str, Letter]:
         names = _LETTERS.get(kind.name, own)
         for k, name in enumerate(names if hinge or upright else names[:1]):
             if name in found or name in (CORE, *MOUNTING, *MOVING):
-                raise InputError(
-                    f"bodies.modules: expected types with letters of their own; found {name!r} "
-                    f"of {kind.name}, which stands for something else"
-                )
+                taken = f"{name!r} of {kind.name}, which stands for something else"
+                raise InputError("bodies.modules", "types with letters of their own", taken)
             found[name] = Letter(kind, upright=k == 1)
     return found
 
