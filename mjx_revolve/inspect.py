@@ -39,23 +39,18 @@ def main(argv: list[str] | None = None) -> int:
             "inspect mine.yaml --modules my_modules.yaml",
         ),
     )
-    parser.add_argument("file", type=read_path, help="morphology YAML")
-    parser.add_argument("--picture", type=read_path, metavar="OUT.png", help="draw it as well")
-    parser.add_argument(
+    add = parser.add_argument
+    add("file", type=read_path, help="morphology YAML")
+    add("--picture", type=read_path, metavar="OUT.png", help="draw it as well")
+    add(
         "--density",
         type=positive("kg/m3"),
         default=_DENSITY,
         help="of the water, kg/m³ (default %(default)s)",
     )
-    parser.add_argument(
-        "--gravity", type=positive("m/s2"), default=_GRAVITY, help="m/s² (default %(default)s)"
-    )
-    parser.add_argument(
-        "--modules", type=read_path, metavar="MY.yaml", help="module types of your own"
-    )
-    parser.add_argument(
-        "--allow-overlap", action="store_true", help="accept modules that reach into each other"
-    )
+    add("--gravity", type=positive("m/s2"), default=_GRAVITY, help="m/s² (default %(default)s)")
+    add("--modules", type=read_path, metavar="MY.yaml", help="module types of your own")
+    add("--allow-overlap", action="store_true", help="accept modules that reach into each other")
     arguments = parser.parse_args(argv)
     modules = {} if arguments.modules is None else load_modules(arguments.modules)
     morphology = load_morphology(

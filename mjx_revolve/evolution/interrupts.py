@@ -14,7 +14,7 @@ import stat
 import sys
 import threading
 from collections.abc import Callable
-from typing import Any, NoReturn
+from typing import NoReturn
 
 # Requests to end a process; SIGHUP is a lost terminal.
 _SIGNALS = tuple(
@@ -43,10 +43,8 @@ class Interrupts:
         self.rescue: Callable[[], None] = lambda: None
         self._answer: str | None = None
         self._answering = threading.RLock()  # the handler may come in the middle of itself
-        self._previous: dict[int, Any] = {}
-        self._ends: tuple[socket.socket, socket.socket] | None = None
-        self._thread: threading.Thread | None = None
-        self._former = -1
+        self._numbers: set[int] = set()
+        self._undo = contextlib.ExitStack()
 
     def finish_first(self, answer: str) -> None:
         """From now on the first signal is only noted, and answered by a line."""
@@ -55,29 +53,25 @@ class Interrupts:
     def __enter__(self) -> Interrupts:
         if threading.current_thread() is not threading.main_thread():
             return self  # its owner handles signals
-        ears, mouth = self._ends = socket.socketpair()
+        ears, mouth = socket.socketpair()
         mouth.setblocking(False)
-        self._former = signal.set_wakeup_fd(mouth.fileno(), warn_on_full_buffer=False)
+        thread = threading.Thread(target=self._listen, args=(ears,), daemon=True)
+        # What ends it, in reverse: `mouth.close` is the end, for the thread.
+        for end in (ears.close, thread.join, mouth.close):
+            self._undo.callback(end)
+        former = signal.set_wakeup_fd(mouth.fileno(), warn_on_full_buffer=False)
+        self._undo.callback(signal.set_wakeup_fd, former)
         for number in _SIGNALS:
             # Under nohup, SIGHUP is ignored; it stays so.
             if number != signal.SIGINT and signal.getsignal(number) is signal.SIG_IGN:
                 continue
-            self._previous[number] = signal.signal(number, self._note)
-        self._thread = threading.Thread(target=self._listen, args=(ears,), daemon=True)
-        self._thread.start()
+            self._numbers.add(number)
+            self._undo.callback(signal.signal, number, signal.signal(number, self._note))
+        thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._ends is None or self._thread is None:
-            return
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-        signal.set_wakeup_fd(self._former)
-        ears, mouth = self._ends
-        mouth.close()  # the end, for the thread
-        self._thread.join()
-        ears.close()
-        self._ends = None
+        self._undo.close()
 
     def _note(self, number: int, _: object) -> None:
         """Python's own handler; it may come later than `_listen`, or earlier."""
@@ -96,7 +90,7 @@ class Interrupts:
         count = 0
         while came := ears.recv(1):
             number = came[0]
-            if number not in self._previous:  # all signals arrive here, other handlers' included
+            if number not in self._numbers:  # all signals arrive here, other handlers' included
                 continue
             count += 1
             _leave_lost_terminal()
