@@ -126,8 +126,7 @@ class Run:
             WorkerError: workers cannot be started.
         """
         config = load_config(path, settings)
-        if config.evolution.tensorboard:
-            check_tensorboard(config.source)
+        check_tensorboard(config, config.source)
         if out:
             check_new_folder(out)  # before the expensive part
         place = Path(out) if out else _RUNS / "any"
@@ -179,8 +178,7 @@ class Run:
             check_unchanged(old, config, label)
             free = {key: getattr(config.evolution, key) for key in FREE_SETTINGS}
             config = old.model_copy(update={"evolution": old.evolution.model_copy(update=free)})
-            if config.evolution.tensorboard:
-                check_tensorboard(label)
+            check_tensorboard(config, label)
             checkpoint = files.load_checkpoint() if files.checkpoints() else None
             for name in checkpoint.damaged if checkpoint else ():
                 _log.warning("passed over a damaged checkpoint: %s", name)
@@ -193,10 +191,8 @@ class Run:
                 raise InputError(label, "the config.yaml that it began with", "it changed")
             executor = _prepare(config, make_executor)
             if begun.get("model_hash") != model_hash(executor.fitness):
-                raise InputError(
-                    f"{label}: expected the robot and the world that it began with; found them "
-                    "changed (a file that config.yaml names, or the program)"
-                )
+                changed = "them changed (a file that config.yaml names, or the program)"
+                raise InputError(label, "the robot and the world that it began with", changed)
             if checkpoint is None and files.champion_path:
                 # A champion is written after a checkpoint: all of them are lost, which this says.
                 files.load_checkpoint()
@@ -416,11 +412,9 @@ def _prepare(config: Config, make_executor: MakeExecutor) -> Executor:
     executor = make_executor(config)
     fitness = executor.fitness
     if isinstance(fitness, Fitness) and not fitness.engine.plant.num_actuators:
-        name = show(fitness.robot.morphology.name)
-        raise InputError(
-            f"{config.source}: morphology: expected a robot with hinges or thrusters, as its "
-            f"controller is to evolve; found none in {name}"
-        )
+        robot = "a robot with hinges or thrusters, as its controller is to evolve"
+        found = f"none in {show(fitness.robot.morphology.name)}"
+        raise InputError(f"{config.source}: morphology", robot, found)
     check_memory(config, executor.num_genes)
     return executor
 

@@ -117,9 +117,8 @@ def next_step(plan: Plan) -> Step:
         found, length = _generations(run), wanted.evolution.generations
         finished = "finished" in run.info
     if found > length:
-        raise InputError(
-            label, f"a run of {length} generations at most", f"{found} (choose another --out)"
-        )
+        most = f"a run of {length} generations at most"
+        raise InputError(label, most, f"{found} (choose another --out)")
     if finished and found == length:
         return "finished"
     return "continue"
@@ -249,8 +248,7 @@ def choose_steps(
                     continue
                 seen.add(plan.case)
                 config = plan.config
-                if config.evolution.tensorboard:
-                    check_tensorboard(config.source)
+                check_tensorboard(config, config.source)
                 with opening_config(plan.base):
                     check_search(config, executors(config))
             except InputError as error:

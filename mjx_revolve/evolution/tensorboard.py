@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from mjx_revolve.episodes.config import Config
 from mjx_revolve.inputs.files import naming
 from mjx_revolve.inputs.packages import check_package
 
@@ -25,9 +26,10 @@ _GROUPS = {
 }  # fmt: skip
 
 
-def check_tensorboard(source: str) -> None:
-    """Raises InputError, naming the configuration's `source`, if tensorboardX is missing."""
-    check_package(f"{source}: evolution.tensorboard", "tensorboardX")
+def check_tensorboard(config: Config, source: str) -> None:
+    """Raises InputError, naming the `source`, if tensorboardX is wanted and missing."""
+    if config.evolution.tensorboard:
+        check_package(f"{source}: evolution.tensorboard", "tensorboardX")
 
 
 class TensorBoardLog:
