@@ -8,9 +8,10 @@ algorithm", IEEE Trans. Evolutionary Computation 22(4), 2018.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -148,10 +149,7 @@ def insert(archive: Archive, ids: np.ndarray, scores: np.ndarray, points: np.nda
         The archive.
     """
     cells = np.where(np.isfinite(scores), cell_of(archive, points), -1)
-    new = replace(
-        archive,
-        ids=archive.ids.copy(), scores=archive.scores.copy(), points=archive.points.copy(),
-    )  # fmt: skip
+    new = copy.deepcopy(archive)
     for row in np.argsort(ids):
         cell = cells[row]
         if cell >= 0 and not new.scores[cell] >= scores[row]:

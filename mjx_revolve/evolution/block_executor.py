@@ -65,9 +65,7 @@ class Executor:
         """Scores a population: `[P]`; see `evaluate`."""
         return self.evaluate(population, key)[0]
 
-    def evaluate(
-        self, population: ArrayLike, key: jax.Array
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    def evaluate(self, population: ArrayLike, key: jax.Array) -> Scored:
         """Scores a population and measures how it moved.
 
         Args:
@@ -83,17 +81,14 @@ class Executor:
         """
         import numpy as np
 
-        from mjx_revolve.evolution.blocks import split_blocks
+        from mjx_revolve.evolution.blocks import join, split_blocks, take
 
         population = np.asarray(population, np.float32)
         if population.ndim != 2 or population.shape[1] != self.num_genes or len(population) < 1:
             raise InputError("population", f"[P, {self.num_genes}]", list(population.shape))
         blocks = split_blocks(population, self.block or len(population))
-        scores, measures = zip(*self.score([(block,) for block in blocks], key), strict=True)
-        size = len(population)
-        return np.concatenate(scores)[:size], {
-            name: np.concatenate([each[name] for each in measures])[:size] for name in measures[0]
-        }
+        scored = self.score([(block,) for block in blocks], key)
+        return take(join(scored), slice(len(population)))
 
     def score(self, blocks: Sequence[Block], key: jax.Array) -> list[Scored]:
         """Scores blocks of the fitness's arguments.

@@ -8,6 +8,7 @@ the last bit for any number of workers.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -30,6 +31,18 @@ def evaluate_block(fitness: Any, block: Block, key: jax.Array) -> Scored:
     return np.asarray(scores, np.float32), {
         name: np.asarray(values, np.float32) for name, values in measures.items()
     }
+
+
+def join(parts: Sequence[Scored]) -> Scored:
+    """Scores and measures of several blocks, one after the other."""
+    return np.concatenate([scores for scores, _ in parts]), {
+        name: np.concatenate([measures[name] for _, measures in parts]) for name in parts[0][1]
+    }
+
+
+def take(scored: Scored, rows: slice | np.ndarray) -> Scored:
+    """Some rows of scores and measures."""
+    return scored[0][rows], {name: values[rows] for name, values in scored[1].items()}
 
 
 def key_as_data(key: jax.Array) -> KeyData:

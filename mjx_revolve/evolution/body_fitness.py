@@ -7,7 +7,7 @@ holds one body, which is faster; else bodies share chunks.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -16,7 +16,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology, load_morphology, trim_neutral
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import Robot
@@ -32,7 +31,7 @@ from mjx_revolve.episodes.measure_table import MEASURES
 from mjx_revolve.episodes.named_files import read_modules, read_world
 from mjx_revolve.evolution.blocks import block_size
 from mjx_revolve.evolution.brains import BrainEncoding, GeneLayout, gene_layout, make_brain_encoding
-from mjx_revolve.genotypes.genotype import Genotype, Space, accept_all, cached, make_space
+from mjx_revolve.genotypes.genotype import Genotype, accept_all, cached, make_space
 from mjx_revolve.genotypes.kinds import find_genotype
 from mjx_revolve.inputs.errors import InputError
 
@@ -184,7 +183,11 @@ def make_body_fitness(config: Config) -> BodyFitness:
     modules = read_modules(config)
     try:
         space = make_space(bodies, modules, _bound_of_trim(config))
-        seeds = tuple(_load_seed(path, modules, config, space) for path in bodies.seeds)
+        seeds = []
+        for path in bodies.seeds:
+            seeds.append(load_morphology(path, modules, config.allow_overlap))
+            if reason := space.refuses(seeds[-1]):
+                raise InputError(f"bodies.seeds: {path}: {reason}")
         genotype = find_genotype(bodies.genotype, space, bodies.params, config.source)
         if seeds and genotype.adopt is None:
             none = f"none, as no {bodies.name} grows into a given robot"
@@ -199,7 +202,7 @@ def make_body_fitness(config: Config) -> BodyFitness:
     except InputError as error:
         raise config.blame(error) from None
 
-    return BodyFitness(config, genotype, mixed, brains, seeds)
+    return BodyFitness(config, genotype, mixed, brains, tuple(seeds))
 
 
 def _ask_for_measures(config: Config) -> Config:
@@ -230,13 +233,3 @@ def _can_be_trimmed(body: Morphology, density: float) -> bool:
         trim_neutral(body, density)
         return True
     return False
-
-
-def _load_seed(
-    path: str, modules: Mapping[str, ModuleType], config: Config, space: Space
-) -> Morphology:
-    body = load_morphology(path, modules, config.allow_overlap)
-    reason = space.refuses(body)
-    if reason:
-        raise InputError(f"bodies.seeds: {path}: {reason}")
-    return body

@@ -8,7 +8,7 @@ be used for all.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Annotated, NamedTuple, Protocol, TypeVar
 
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from mjx_revolve.control.controller import Controller, Gene, gene_indices
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.episodes.bodies_config import BrainsConfig
+from mjx_revolve.genotypes.cppn import FUNCTIONS
 from mjx_revolve.genotypes.genotype import Origins
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.schema import Number, read, words
@@ -29,12 +30,7 @@ _HIDDEN = 12
 _LENGTH = 0.1
 # A brain of genes by name. (Of a `dict`, messages would name the gene that is wrong.)
 _NAMED = Annotated[Mapping[str, Number], words("genes by name")]
-_FUNCTIONS: tuple[Callable[[np.ndarray], np.ndarray], ...] = (
-    np.sin,
-    np.tanh,
-    lambda x: np.exp(-x * x),
-    np.abs,
-)
+_FUNCTIONS = [FUNCTIONS[name] for name in ("sin", "tanh", "gauss", "abs")]
 
 
 class GeneLayout(NamedTuple):
@@ -185,8 +181,9 @@ class NamedGenes:
         found = [find(*gene) for gene in zip(layout.names, layout.genes, strict=True)]
         have = np.array([value is not None for value in found], bool)
         values = np.array([0.0 if value is None else value for value in found])
+        kinds = [(gene.what, gene.place) for gene in layout.genes]
         for k in np.flatnonzero(~have):
-            alike = [i for i in np.flatnonzero(have) if _alike(layout.genes[i], layout.genes[k])]
+            alike = [i for i in np.flatnonzero(have) if kinds[i] == kinds[k]]
             away = np.linalg.norm(layout.place[alike] - layout.place[k], axis=1)
             values[k] = values[alike[int(np.argmin(away))]] if alike else fresh[k]
         return _named(layout, values + noise)
@@ -214,10 +211,6 @@ class NamedGenes:
 
 def _named(layout: GeneLayout, values: Iterable[float]) -> dict[str, float]:
     return {n: float(np.float32(x)) for n, x in zip(layout.names, values, strict=True)}
-
-
-def _alike(one: Gene, other: Gene) -> bool:
-    return one.what == other.what and one.place == other.place
 
 
 class PatternNetwork:

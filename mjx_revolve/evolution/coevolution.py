@@ -20,7 +20,7 @@ from mjx_revolve.episodes.run_reader import arrays_of
 from mjx_revolve.evolution import archive as archives
 from mjx_revolve.evolution.archive import Archive, make_archive
 from mjx_revolve.evolution.executor import Executor
-from mjx_revolve.evolution.generations import Generation
+from mjx_revolve.evolution.generations import Evolution, Generation
 from mjx_revolve.evolution.individual_search import (
     IndividualEvolution,
     finite_mean,
@@ -88,7 +88,7 @@ class _Proposal(NamedTuple):
     key: jax.Array
 
 
-class BodyEvolution(IndividualEvolution):
+class BodyEvolution(IndividualEvolution, Evolution[BodySearch, _Proposal, list[Individual]]):
     """Evolves bodies and brains; see `generations.Evolution`."""
 
     def __init__(self, config: Config, executor: Executor) -> None:

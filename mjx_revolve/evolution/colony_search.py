@@ -29,7 +29,7 @@ from mjx_revolve.evolution.colony import (
     wrap_edges,
 )
 from mjx_revolve.evolution.executor import Executor
-from mjx_revolve.evolution.generations import Generation
+from mjx_revolve.evolution.generations import Evolution, Generation
 from mjx_revolve.evolution.individual_search import (
     IndividualEvolution,
     finite_mean,
@@ -62,7 +62,7 @@ class ColonyInterval(NamedTuple):
     rng: np.random.Generator
 
 
-class ColonyEvolution(IndividualEvolution):
+class ColonyEvolution(IndividualEvolution, Evolution[Colony, ColonyInterval, TankTrajectory]):
     """A colony as a search; see `generations.Evolution`.
 
     All randomness follows from the seed and the interval's number.
@@ -215,10 +215,6 @@ class ColonyEvolution(IndividualEvolution):
             GENERATIONS: [living_line(search)],
             EVENTS: [json.dumps(event, separators=(",", ":")) for event in search.events],
         }
-
-    def files(self, search: Colony) -> Mapping[str, bytes]:
-        """None beside the logs."""
-        return {}
 
     # --- to and from a checkpoint
 

@@ -15,13 +15,9 @@ import numpy as np
 
 from mjx_revolve.episodes.config import EvolutionConfig
 from mjx_revolve.episodes.passport import Passport, make_passport
+from mjx_revolve.evolution.blocks import Scored, take
 from mjx_revolve.evolution.executor import Executor
-from mjx_revolve.evolution.generations import (
-    Champion,
-    Generation,
-    Scored,
-    choose_candidate,
-)
+from mjx_revolve.evolution.generations import Champion, Evolution, Generation, choose_candidate
 from mjx_revolve.evolution.individuals import NUM_ELITES
 from mjx_revolve.evolution.strategies import STD_FLOOR, Strategy, make_strategy
 from mjx_revolve.inputs.errors import InputError
@@ -78,7 +74,7 @@ _COUNTERS = ("generation", "evaluations", "stalled", "restarts", "seconds")
 _ARRAYS = ("elites", "elite_scores", "elite_generations", "latest")
 
 
-class GeneEvolution:
+class GeneEvolution(Evolution[GeneSearch, _Proposal, Scored]):
     """Evolves genes with an evosax strategy; see `generations.Evolution`.
 
     A strategy is started anew at random genes, the champion being kept, when its population has
@@ -173,14 +169,6 @@ class GeneEvolution:
             search.evaluations,
         )  # fmt: skip
 
-    def logs(self, search: GeneSearch) -> Mapping[str, Sequence[str]]:
-        """None beside the metrics."""
-        return {}
-
-    def files(self, search: GeneSearch) -> Mapping[str, bytes]:
-        """None beside the champion's."""
-        return {}
-
     def best(self, search: GeneSearch) -> Champion:
         """The best of all generations."""
         origin = f"best of generation {search.elite_generations[0]}"
@@ -212,9 +200,7 @@ class GeneEvolution:
         def score(indices: Sequence[int], key: jax.Array) -> Scored:
             """One shape for all calls: filled up with the first candidate."""
             rows = [*indices, *[indices[0]] * (count - len(indices))]
-            scores, measures = self._score(genes[rows], key)
-            n = len(indices)
-            return scores[:n], {name: values[:n] for name, values in measures.items()}
+            return take(self._score(genes[rows], key), slice(len(indices)))
 
         def judge(k: int) -> Passport:
             return make_passport(self.executor.fitness, genes[k], self.config.seed)
@@ -250,10 +236,8 @@ class GeneEvolution:
             found = arrays.get(name)
             if found is None or found.shape != value.shape or found.dtype != value.dtype:
                 what = "nothing" if found is None else f"{found.dtype} {list(found.shape)}"
-                raise InputError(
-                    f"{name}: expected {value.dtype} {list(value.shape)}, as "
-                    f"{self.config.strategy} of this version has it; found {what}"
-                )
+                own = f"as {self.config.strategy} of this version has it"
+                raise InputError(name, f"{value.dtype} {list(value.shape)}, {own}", what)
         if not np.array_equal(arrays["root_key"], expected["root_key"]):
             raise InputError("root_key", f"the key of evolution.seed {self.config.seed}", "another")
         paths, structure = jax.tree_util.tree_flatten_with_path(template.state)

@@ -137,9 +137,11 @@ class Evolution(Protocol[S, P, R]):
 
     def logs(self, search: S) -> Mapping[str, Sequence[str]]:
         """Lines that the last generation adds to the run folder's logs, by the file's name."""
+        return {}
 
     def files(self, search: S) -> Mapping[str, bytes]:
         """Files of the run folder that are written anew with each checkpoint, by name."""
+        return {}
 
     def best(self, search: S) -> Champion | None:
         """The champion so far, not yet evaluated on fresh starts; None: every rollout failed."""

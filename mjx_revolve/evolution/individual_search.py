@@ -12,7 +12,7 @@ import numpy as np
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.passport import STEP, Passport, joint_checks, make_passport
 from mjx_revolve.episodes.scoring import replay_key
-from mjx_revolve.evolution.blocks import Scored
+from mjx_revolve.evolution.blocks import Scored, join
 from mjx_revolve.evolution.body_fitness import BodyFitness
 from mjx_revolve.evolution.executor import Executor
 from mjx_revolve.evolution.generations import Champion, SearchState, choose_candidate
@@ -66,9 +66,7 @@ class IndividualEvolution:
         def score(indices: Sequence[int], key: jax.Array) -> Scored:
             chosen = [candidates[k] for k in indices]
             genes = [learnt_genes(self.fitness, one) for one in chosen]
-            found = score_brains(self.executor, chosen, genes, key)
-            measures = {name: np.concatenate([m[name] for _, m in found]) for name in found[0][1]}
-            return np.concatenate([scores for scores, _ in found]), measures
+            return join(score_brains(self.executor, chosen, genes, key))
 
         seed = self.config.evolution.seed
 

@@ -7,6 +7,7 @@ depend on the others: keys follow from its number, and blocks have a fixed shape
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.episodes.bodies_config import LearningConfig
-from mjx_revolve.evolution.blocks import Scored
+from mjx_revolve.evolution.blocks import Scored, join, take
 from mjx_revolve.evolution.body_fitness import BodyFitness
 from mjx_revolve.evolution.brains import GeneLayout
 from mjx_revolve.evolution.executor import Executor
@@ -56,10 +57,8 @@ def make_learner(settings: LearningConfig, size: int) -> Strategy | Perturbation
     """
     once = settings.generations == 1
     if settings.population_size < 2 and not once:
-        raise InputError(
-            "bodies.learning.population_size: expected at least 2, as there are "
-            f"{settings.generations} generations to learn in; found 1"
-        )
+        least = f"at least 2, as there are {settings.generations} generations to learn in"
+        raise InputError("bodies.learning.population_size", least, 1)
     try:
         if not once:
             return make_strategy(settings, size)
@@ -67,10 +66,7 @@ def make_learner(settings: LearningConfig, size: int) -> Strategy | Perturbation
             find_strategy(settings.strategy)
         return Perturbation(settings.population_size, settings.std_init)
     except InputError as error:
-        text = str(error)
-        if text.startswith("evolution."):
-            text = "bodies.learning." + text.removeprefix("evolution.")
-        raise InputError(text) from None
+        raise InputError(re.sub(r"^evolution\.", "bodies.learning.", str(error))) from None
 
 
 @dataclass
@@ -205,7 +201,7 @@ def score_brains(
     individuals: Sequence[Individual],
     genes: Sequence[np.ndarray],
     key: jax.Array,
-) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
+) -> list[Scored]:
     """Scores several brains of each of several bodies.
 
     Args:
@@ -235,15 +231,11 @@ def score_brains(
         full = np.concatenate([part, np.full(size - len(part), part[0])])
         bodies, which = np.unique(owner[full], return_inverse=True)
         blocks.append((rows[full], which.astype(np.int32), [individuals[k].body for k in bodies]))
-    scores = np.full(len(rows), np.nan, np.float32)
-    measures: dict[str, np.ndarray] = {}
-    for part, (found, figures) in zip(cut, executor.score(blocks, key), strict=True):
-        scores[part] = np.asarray(found)[: len(part)]
-        for name, values in figures.items():
-            whole = measures.setdefault(name, np.full(len(rows), np.nan, np.float32))
-            whole[part] = np.asarray(values)[: len(part)]
+    found = zip(executor.score(blocks, key), cut, strict=True)
+    scores, measures = join([take(scored, slice(len(part))) for scored, part in found])
     scores[scores <= fitness.worst_score] = -np.inf
-    return [(scores[k], {name: values[k] for name, values in measures.items()}) for k in mine]
+    place = np.argsort(np.concatenate(cut))
+    return [take((scores, measures), place[k]) for k in mine]
 
 
 def _size(body: Morphology) -> tuple[int, int]:

@@ -30,9 +30,8 @@ def make_founders(
     Yields:
         As many individuals as there are generators.
     """
-    bodies, seeds = fitness.config.bodies, fitness.seeds if sow else ()
-    assert bodies is not None
-    sown = round((1 - bodies.random) * len(rngs))
+    seeds = fitness.seeds if sow else ()
+    sown = round((1 - fitness.bodies.random) * len(rngs))
     sown = max(sown, min(len(seeds), len(rngs))) if seeds else 0
     for k, rng in enumerate(rngs):
         seed = seeds[k % len(seeds)] if k < sown else None
