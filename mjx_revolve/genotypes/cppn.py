@@ -12,8 +12,8 @@ innovation gets the same number in every genome, without a shared register.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable
-from typing import Annotated, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import Annotated, NamedTuple, TypeVar
 
 import numpy as np
 from annotated_types import Ge, Unit
@@ -75,6 +75,9 @@ class Connection(NamedTuple):
     source: int
     target: int
     weight: float
+
+
+G = TypeVar("G", Node, Connection)
 
 
 class CPPN(NamedTuple):
@@ -294,19 +297,8 @@ def cross_cppns(rng: np.random.Generator, a: CPPN, b: CPPN, settings: CPPNSettin
         The child.
     """
     if settings.innovations:
-        weights = {(link.source, link.target): link for link in b.links}
-        functions = {node.number: node for node in b.nodes}
-        from_b = (rng.random(len(a.links)) < 0.5, rng.random(len(a.nodes)) < 0.5)
-        return a._replace(
-            links=tuple(
-                weights.get((link.source, link.target), link) if other else link
-                for link, other in zip(a.links, from_b[0], strict=True)
-            ),
-            nodes=tuple(
-                functions.get(node.number, node) if other else node
-                for node, other in zip(a.nodes, from_b[1], strict=True)
-            ),
-        )
+        links, nodes = _either(rng, a.links, b.links), _either(rng, a.nodes, b.nodes)
+        return a._replace(links=links, nodes=nodes)
     other = rng.random(a.num_outputs) < 0.5
     one = _part(a, [k for k in range(a.num_outputs) if not other[k]])
     two = _part(b, [k for k in range(a.num_outputs) if other[k]])
@@ -320,6 +312,14 @@ def cross_cppns(rng: np.random.Generator, a: CPPN, b: CPPN, settings: CPPNSettin
         for source, target, weight in two.links
     )
     return a._replace(nodes=(*one.nodes, *nodes), links=(*one.links, *links))
+
+
+def _either(rng: np.random.Generator, ours: Sequence[G], theirs: Sequence[G]) -> tuple[G, ...]:
+    """Links or nodes, with even chance theirs of the same number: all values but the last."""
+    matching = {gene[:-1]: gene for gene in theirs}
+    other = rng.random(len(ours)) < 0.5
+    pairs = zip(ours, other, strict=True)
+    return tuple(matching.get(gene[:-1], gene) if hit else gene for gene, hit in pairs)
 
 
 # ------------------------------------------------------------------------- reading
