@@ -213,39 +213,6 @@ def pairs_within(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.
     return one, start[one] + rank
 
 
-class _Parts(NamedTuple):
-    """The first fields of a `RestPose`."""
-
-    parts: tuple[Part, ...]
-    kind: np.ndarray
-    body: np.ndarray
-    module: np.ndarray
-    position: np.ndarray
-    rotation: np.ndarray
-
-
-def _place_parts(bodies: Sequence[Sequence[Module]]) -> _Parts:
-    """Poses of the parts of some bodies at rest."""
-    modules = [m for body in bodies for m in body]
-    listed = [part for m in modules for part in m.kind.parts]
-    # Most modules share a type and its parts: each distinct part is read once.
-    given = {id(part): part for part in listed}
-    number = {key: k for k, key in enumerate(given)}
-    kind = np.array([number[id(part)] for part in listed])
-    module = counted(np.array([len(m.kind.parts) for m in modules]))[0]
-    rotation = np.array([m.rotation for m in modules])[module]
-    origin = np.array([m.position for m in modules])[module]
-    local = np.array([part.position for part in given.values()])[kind]
-    return _Parts(
-        parts=tuple(given.values()),
-        kind=kind,
-        body=counted(np.array([len(body) for body in bodies]))[0][module],
-        module=module,
-        position=origin + turned(rotation, local),
-        rotation=rotation,
-    )
-
-
 def rest_pose(*bodies: Sequence[Module]) -> RestPose:
     """Where all parts and boxes lie at rest.
 
@@ -255,15 +222,29 @@ def rest_pose(*bodies: Sequence[Module]) -> RestPose:
     Returns:
         The layout.
     """
-    placed = _place_parts(bodies)
-    parts, kind = placed.parts, placed.kind
+    modules = [m for body in bodies for m in body]
+    listed = [part for m in modules for part in m.kind.parts]
+    # Most modules share a type and its parts: each distinct part is read once.
+    given = {id(part): part for part in listed}
+    number = {key: k for k, key in enumerate(given)}
+    kind = np.array([number[id(part)] for part in listed])
+    module = counted(np.array([len(m.kind.parts) for m in modules]))[0]
+    rotation = np.array([m.rotation for m in modules])[module]
+    origin = np.array([m.position for m in modules])[module]
+    parts = tuple(given.values())
+    local = np.array([part.position for part in parts])[kind]
     boxes = [box for part in parts for box in part.boxes]
     size = np.array([len(part.boxes) for part in parts])
     bounds = np.array([part.bounds for part in parts])
     box_part, rank = counted(size[kind])
     box = (np.cumsum(size) - size)[kind[box_part]] + rank
     return RestPose(
-        *placed,
+        parts=parts,
+        kind=kind,
+        body=counted(np.array([len(body) for body in bodies]))[0][module],
+        module=module,
+        position=origin + turned(rotation, local),
+        rotation=rotation,
         low=bounds[kind, 0],
         high=bounds[kind, 1],
         main=np.cumsum(size[kind]) - size[kind],
@@ -291,19 +272,18 @@ def find_overlaps(
     Returns:
         pairs of indices, in order.
     """
-    all_parts = _place_parts([modules])
-    center, turn = all_parts.position, all_parts.rotation
-    half = np.array([part.boxes[0].size for part in all_parts.parts])[all_parts.kind] / 2
+    layout = rest_pose(modules)
+    center, turn, half = layout.position, layout.rotation, layout.box_half[layout.main]
     half = half - np.minimum(tolerance, half / 2)
     reach = turned(np.abs(turn), half)
     compared = np.full(len(modules), moved is None)
     compared[list(moved or ())] = True
-    rows = np.flatnonzero(compared[all_parts.module])
+    rows = np.flatnonzero(compared[layout.module])
     # Most pairs are already apart along the core's axes.
     gap = np.abs(center[rows, None] - center) - reach[rows, None] - reach
     first, second = np.nonzero((gap < 0).all(-1))
     first = rows[first]
-    a, b = all_parts.module[first], all_parts.module[second]
+    a, b = layout.module[first], layout.module[second]
     parent = np.array([m.parent for m in modules])
     apart = (a != b) & (parent[a] != b) & (parent[b] != a)
     first, second = first[apart], second[apart]
