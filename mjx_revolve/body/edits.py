@@ -29,7 +29,7 @@ from mjx_revolve.body.morphology import (
     read_slot,
 )
 from mjx_revolve.body.placement import Module, attach, check_overlaps, check_rigid
-from mjx_revolve.body.tree import Morphology
+from mjx_revolve.body.tree import Morphology, free_name
 from mjx_revolve.inputs.errors import InputError, show
 
 
@@ -384,12 +384,9 @@ def _name_apart(graft: Sequence[Module], kept: Iterable[Module]) -> list[Module]
     used = taken | {module.name for module in graft}
     found = []
     for module in graft:
-        name, count = module.name, 2
-        module = replace(module, origin=module.origin or (0, name))
-        if name in taken:
-            stem = re.sub(r"_[0-9]+$", "", name)
-            while name in used:
-                name, count = f"{stem}_{count}", count + 1
+        module = replace(module, origin=module.origin or (0, module.name))
+        if module.name in taken:
+            name = free_name(re.sub(r"_[0-9]+$", "", module.name), used)
             used.add(name)
             module = replace(module, name=name)
         found.append(module)

@@ -94,8 +94,7 @@ def exposure(parts: RestPose) -> Exposure:
             covered[part[k], side, axis] |= inside.all(axis=-1).any(axis=0) @ _BITS[:-1]
     hidden = np.bitwise_count(covered & silhouette[:, None]).sum(axis=-1)
     whole = np.maximum(np.bitwise_count(silhouette).sum(axis=-1), 1)
-    cover = np.bitwise_count(covered & silhouette[:, None]).sum(axis=-1) / whole[:, None]
-    near = neighbour >= 0
+    near, cover = neighbour >= 0, hidden / whole[:, None]
     joined = np.where(near.any(1), (near * cover).sum(1) / np.maximum(near.sum(1), 1), 1.0)
     shares = 1 - hidden.sum(axis=1) / (2 * whole)
     ends = np.where(near.any(1), near[:, 0].astype(int) - near[:, 1], 0)

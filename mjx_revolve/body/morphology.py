@@ -22,8 +22,8 @@ from mjx_revolve.body.coefficients import correct_modules, load_coefficients
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.params import apply_overrides, check_overrides, read_number
 from mjx_revolve.body.placement import Module, attach, check_overlaps, check_rigid, frozen
-from mjx_revolve.body.sensors import Sensor, SensorRow
-from mjx_revolve.body.tree import COLORS, Morphology, save_morphology
+from mjx_revolve.body.sensors import SensorRow
+from mjx_revolve.body.tree import COLORS, Morphology, free_name, save_morphology
 from mjx_revolve.inputs.errors import InputError, note, show
 from mjx_revolve.inputs.schema import Positive, Text, read, words
 from mjx_revolve.inputs.shipped import find_shipped
@@ -157,20 +157,14 @@ def _make(
         place = Path(source).parent / named
         tree = correct_modules(tree, load_coefficients(place), str(place))
     check_rigid(tree, f"{source}: body")
+    sensors = data.get("sensors")
     return Morphology(
         name=_read_id(data.get("id"), f"{source}: id") or name,
         modules=tree,
         brain=copy.deepcopy(data.get("brain")),
         overlaps=check_overlaps(tree, allow_overlap, f"{source}: body"),
-        sensors=_read_sensors(data.get("sensors"), source),
+        sensors=None if sensors is None else read(SensorRow, sensors, f"{source}: sensors"),
     )
-
-
-def _read_sensors(value: object, source: str) -> tuple[Sensor, ...] | None:
-    """The sensors of a robot; None if the file has no such key."""
-    if value is None:
-        return None
-    return read(SensorRow, value, f"{source}: sensors")
 
 
 def _check_known(item: Mapping[object, object], known: tuple[str, ...], place: str) -> None:
@@ -378,17 +372,12 @@ def _read_params(
 def _with_unique_names(modules: list[Module], source: str) -> tuple[Module, ...]:
     """The modules with unique names: suffixes for repeated names and for those of MuJoCo's own."""
     names = [m.name for m in modules]
-    taken, seen = {*names}, {*RESERVED}
+    taken, seen = {*names, *RESERVED}, {*RESERVED}
     for i, name in enumerate(names):
-        count = 2
-        while name in seen:
-            name = f"{names[i]}_{count}"
-            count += 1
-            if name in taken:  # another module's own name
-                name = names[i]
-        taken.add(name)
-        seen.add(name)
-        names[i] = name
+        if name in seen:  # a later module's own name is not taken from it
+            names[i] = free_name(name, taken)
+        taken.add(names[i])
+        seen.add(names[i])
     pairs = [(m.name, name) for m, name in zip(modules, names, strict=True) if m.name != name]
     if pairs:
         changed = ", ".join(f"{old} is now {new}" for old, new in pairs[:3])

@@ -216,9 +216,8 @@ class Sensor:
             what = f"none, as {self.type} is of the robot as a whole"
             raise ConstraintError(key, what, show(getattr(self, key)))
         if self.each is not None and kind.where != "robot":
-            what = f"none, as {self.type} is at each hinge" if kind.where == "joint" else "none, as"
-            what += "" if kind.where == "joint" else f" {self.type} is of each rigid body"
-            raise ConstraintError("each", what, show(self.each))
+            where = "at each hinge" if kind.where == "joint" else "of each rigid body"
+            raise ConstraintError("each", f"none, as {self.type} is {where}", show(self.each))
 
     @property
     def place(self) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -267,6 +267,12 @@ def _unpack(
         )
     ]
     return Morphology(name, tuple(modules), brain, path, overlaps, sensors)
+
+
+def free_name(stem: str, taken: Collection[str], first: int = 2) -> str:
+    """The stem with the first free of the suffixes _2, _3 and so on."""
+    numbered = (f"{stem}_{k}" for k in itertools.count(first))
+    return next(name for name in numbered if name not in taken)
 
 
 def save_morphology(morphology: Morphology, path: str | Path) -> None:

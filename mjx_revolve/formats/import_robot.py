@@ -7,7 +7,6 @@ is not uniform over its boxes becomes four points with the link's mass, centre a
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,9 @@ from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.module_files import read_modules
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology, make_morphology
+from mjx_revolve.body.tree import COLORS, free_name
 from mjx_revolve.formats.inertias import spread
-from mjx_revolve.formats.links import plain
+from mjx_revolve.formats.links import plain, unique_names
 from mjx_revolve.formats.rigid_links import RigidLink, RigidRobot, Shape, read_rigid_robot
 from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.files import write_atomic
@@ -103,21 +103,16 @@ def _make(robot: RigidRobot) -> ImportedRobot:
         shapes = link.solid or link.seen
         turn = _frame(link, shapes)
         frames.append(turn)
-        kind, welded = _module(link, shapes, turn, missing)
-        kinds[name] = kind
+        kinds[name], welded = _module(link, shapes, turn, missing)
         rgb = next((s.rgb for s in (*link.seen, *link.solid) if s.rgb), None)
-        color = dict(zip(("red", "green", "blue"), map(float, rgb), strict=True)) if rgb else {}
-        item: dict[str, Any] = {"id": name, "type": name}
-        if color:
-            item["params"] = color
+        item: dict[str, Any] = {"id": name, "type": name} | _color(rgb)
         items.append(item)
         for number, (part, slot) in enumerate(welded, 1):
-            numbered = (f"{name}_{k}" for k in itertools.count(number))
-            own = next(one for one in numbered if one not in taken)
+            own = free_name(name, taken, number)
             taken.add(own)
             kinds[own] = {"mount": {"position": [0.0, 0.0, 0.0], "outward": [1.0, 0.0, 0.0]},
                           "parts": [part]}  # fmt: skip
-            _attach(kinds[name], item, slot, {"id": own, "type": own} | _color(item))
+            _attach(kinds[name], item, slot, {"id": own, "type": own} | _color(rgb))
         if link.parent >= 0:
             above = frames[link.parent]
             slot = _slot(above.T @ link.position, above.T @ link.rotation @ turn)
@@ -147,19 +142,15 @@ def _grouped(missing: list[str]) -> tuple[str, ...]:
     )
 
 
-def _color(item: dict[str, Any]) -> dict[str, Any]:
-    """The colour of a module, for those that are fixed to it."""
-    return {"params": dict(item["params"])} if "params" in item else {}
+def _color(rgb: tuple[float, ...] | None) -> dict[str, Any]:
+    """A module's params with its colour, if there is one."""
+    return {"params": dict(zip(COLORS, map(float, rgb), strict=True))} if rgb else {}
 
 
 def _names(given: list[str]) -> list[str]:
     """Names of types: letters, digits and _, each once."""
-    found: list[str] = []
-    for name in given:
-        base = plain(name) if plain(name)[0].isalpha() else f"m{plain(name)}"
-        numbered = (base if k == 1 else f"{base}_{k}" for k in itertools.count(1))
-        found.append(next(one for one in numbered if one not in (*found, *MODULES)))
-    return found
+    bases = [name if name[0].isalpha() else f"m{name}" for name in map(plain, given)]
+    return unique_names(bases, taken={*MODULES})
 
 
 def _frame(link: RigidLink, shapes: list[Shape]) -> np.ndarray:

@@ -18,6 +18,7 @@ from mjx_revolve.body.module_types import Part
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.body.placement import Module
 from mjx_revolve.body.solids import part_mesh
+from mjx_revolve.body.tree import free_name
 from mjx_revolve.engine.mujoco_model import GREY
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.numerics.spatial import quat_to_matrix
@@ -305,11 +306,8 @@ def unique_names(names: list[str], taken: set[str]) -> list[str]:
     """The names, those that are taken with a number at the end."""
     taken, found = {*taken}, []
     for name in names:
-        count, other = 2, name
-        while other in taken:
-            other, count = f"{name}_{count}", count + 1
-        taken.add(other)
-        found.append(other)
+        found.append(free_name(name, taken) if name in taken else name)
+        taken.add(found[-1])
     return found
 
 
