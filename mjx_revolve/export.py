@@ -165,8 +165,6 @@ def main(argv: list[str] | None = None) -> int:
         if "mcap" in files:
             check_package("--mcap", "rosbags")
     except InputError as error:
-        if arguments.mcap is not None:
-            raise
         lacking.append(f"no bag: {error}")
         del files["mcap"]
     done = export_robot(episode.robot, files, episode.trajectory, arguments.meshes, brain)

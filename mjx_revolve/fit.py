@@ -13,7 +13,6 @@ import argparse
 import datetime
 import shlex
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -220,12 +219,11 @@ def _plan(arguments: argparse.Namespace) -> int:
     robot, *_ = load_robot(arguments.robot, arguments.world, arguments.modules, fields, trim)
     print(plain(f"simulating motions of {robot.morphology.name}"), flush=True)
     plan = plan_motions(robot, _free(arguments.free), settings)
-    names: Sequence[str] = [p.name for p in plan.parameters]
     print(f"{settings.duration:g} s each, {settings.rate:g} frames/s, noise of 5 mm and 1°")
     for k, (motion, spreads) in enumerate(zip(plan.motions, plan.spreads, strict=True), 1):
         print(plain(f"{k}. {motion.words}"))
-        pairs = zip(names, plan.parameters, spreads, strict=True)
-        parts = (f"{n} ± {_expected(p.positive, x)}" for n, p, x in pairs)
+        pairs = zip(plan.parameters, spreads, strict=True)
+        parts = (f"{p.name} ± {_expected(p.positive, x)}" for p, x in pairs)
         print(plain(f"   then: {', '.join(parts)}"))
     for unknown in plan.unknown:
         print(plain(f"still: {unknown.words}"))

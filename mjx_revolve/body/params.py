@@ -62,11 +62,10 @@ def _read_factors(value: object) -> dict[str, object]:
     """Factors, checked: those of `MODULE_FACTORS` here, those on coefficients by `Factors`."""
     if not isinstance(value, dict):
         return read(_Some, value)
-    water = {key: x for key, x in value.items() if key not in MODULE_FACTORS}
     own = {key: x for key, x in value.items() if key in MODULE_FACTORS}
     found = {key: read(Positive, read_number(x), key) for key, x in own.items()}
-    water = dict(read(Factors, water))
-    return found | {k: list(x) if isinstance(x, tuple) else x for k, x in water.items()}
+    water = read(Factors, {key: x for key, x in value.items() if key not in own})
+    return found | {k: list(x) if isinstance(x, tuple) else x for k, x in water}
 
 
 # Params that are assigned to the same field of every part.

@@ -36,17 +36,10 @@ def module_table(morphology: Morphology) -> list[str]:
     ]
     for k, module in enumerate(morphology.modules):
         place = [str(module.parent), str(module.slot), f"{module.orientation:g}"]
-        rows.append(
-            [
-                str(k),
-                module.name,
-                module.type,
-                *(place if module.parent >= 0 else ["-"] * 3),
-                *_meters(module.position),
-                f"{module.kind.mass:.4f}",
-                f"{1e6 * module.kind.volume:.3f}",
-            ]
-        )
+        place = place if module.parent >= 0 else ["-"] * 3
+        amounts = f"{module.kind.mass:.4f}", f"{1e6 * module.kind.volume:.3f}"
+        here = _meters(module.position)
+        rows.append([str(k), module.name, module.type, *place, *here, *amounts])
     return align(rows, left=(1, 2))
 
 
@@ -66,17 +59,11 @@ def thruster_table(morphology: Morphology) -> list[str]:
         thruster = part.thruster
         assert thruster is not None
         local = np.add(part.position, thruster.position)
-        rows.append(
-            [
-                str(index),
-                module.name,
-                *_meters(module.position + module.rotation @ local),
-                *(f"{round(x, 5):z.3g}" for x in module.rotation @ thruster.axis),
-                *(f"{thruster.thrust_at(command):.4g}" for command in thruster.range),
-                f"{thruster.time_constant:g}",
-                f"{thruster.torque_ratio:g}",
-            ]
-        )
+        here = _meters(module.position + module.rotation @ local)
+        axis = (f"{round(x, 5):z.3g}" for x in module.rotation @ thruster.axis)
+        thrusts = (f"{thruster.thrust_at(command):.4g}" for command in thruster.range)
+        lag, torque = f"{thruster.time_constant:g}", f"{thruster.torque_ratio:g}"
+        rows.append([str(index), module.name, *here, *axis, *thrusts, lag, torque])
     return align(rows, left=(1,)) if len(rows) > 2 else []
 
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_revolve.fitting.problem import NOISE, START, FitProblem, Point
+from mjx_revolve.numerics.spatial import quat_mul
 
 # Residuals of more than so many standard deviations count less (Huber's 1.345 for pure noise costs
 # 5 % of the information; frames that a tracker lost lie far beyond 3). A choice.
@@ -198,12 +199,20 @@ def step(problem: FitProblem, state: FitState, system: System) -> tuple[Point, f
     return reached, float(np.abs(move / spread)[:count].max(initial=0.0))
 
 
+def free_information(problem: FitProblem, system: System) -> np.ndarray:
+    """`[P, P]` what the data say of the free numbers, the other common ones unknown."""
+    count, matrix = len(problem.parameters), system.matrix
+    across, rest = matrix[:count, count:], matrix[count:, count:]
+    return matrix[:count, :count] - across @ np.linalg.solve(rest, across.T)
+
+
 def reach(
-    problem: FitProblem, point: Point, system: System, move: np.ndarray, damping: np.ndarray,
-    share: float = 1.0,
+    problem: FitProblem, point: Point, system: System, move: np.ndarray,
+    damping: np.ndarray | None = None, share: float = 1.0,
 ) -> Point:  # fmt: skip
     """Where a `[G]` move of the common numbers leads, and a share of the windows' beginnings'."""
     count = len(problem.parameters)
+    damping = np.zeros(problem.drive.resets.shape) if damping is None else damping
     free = np.array(
         [p.bound(x) for p, x in zip(problem.parameters, point.free + move[:count], strict=True)]
     )
@@ -215,17 +224,21 @@ def reach(
     return Point(free, local, starts)
 
 
+def fitted_by_kind(problem: FitProblem, values: list[np.ndarray]) -> dict[str, np.ndarray]:
+    """Residuals of all that is fitted, by kind, in a row each."""
+    rows: dict[str, list[np.ndarray]] = {}
+    for channel, left in zip(problem.channels, values, strict=True):
+        x = left[channel.fitted]
+        rows.setdefault(channel.kind, []).append(x[np.isfinite(x)])
+    return {kind: np.concatenate(many) for kind, many in rows.items()}
+
+
 def estimate_noise(problem: FitProblem, values: list[np.ndarray], used: float) -> dict[str, float]:
     """Standard deviations by kind, robust against wild frames; `used`: numbers fitted."""
-    squares: dict[str, list[np.ndarray]] = {}
-    for channel, left in zip(problem.channels, values, strict=True):
-        squares.setdefault(channel.kind, []).append(left[channel.fitted].ravel())
-    whole = sum(np.isfinite(x).sum() for many in squares.values() for x in many)
-    share = max(1 - used / max(whole, 1), 0.1)
+    rows = fitted_by_kind(problem, values)
+    share = max(1 - used / max(sum(map(len, rows.values())), 1), 0.1)
     found = {}
-    for kind, each in squares.items():
-        x = np.concatenate(each)
-        x = x[np.isfinite(x)]
+    for kind, x in rows.items():
         sigma = NOISE[kind]
         if len(x) >= FEW:
             # Clipped where Huber's weights begin, again and again.
@@ -335,9 +348,8 @@ def _arrive(pieces: FitProblem, state: FitState) -> FitState:
 
 def _turned(roots: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """States with the core turned about z [rad]."""
-    found, (c, s) = roots.copy(), (np.cos(turn / 2), np.sin(turn / 2))
-    w, x, y, z = (roots[:, 3 + k] for k in range(4))
-    found[:, 3:7] = np.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], 1)
+    found, about_z = roots.copy(), (np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2))
+    found[:, 3:7] = np.stack(quat_mul(about_z, tuple(np.moveaxis(roots[:, 3:7], 1, 0))), 1)
     return found
 
 
@@ -375,8 +387,7 @@ def _look_around(
         move[count:] = np.where(np.tile([n == "clock" for n in problem.local], len(resets[0])),
                                 0.0, move[count:])  # fmt: skip
         points += [
-            reach(problem, state.point, at_rest, far * move, 0.0 * resets)
-            for far in (_AWAY, -_AWAY, 1.0, -1.0)
+            reach(problem, state.point, at_rest, far * move) for far in (_AWAY, -_AWAY, 1.0, -1.0)
         ]
     bent = np.zeros(resets.shape)
     windows, prior = costs_of(problem, state.point, model.values, state.noise)

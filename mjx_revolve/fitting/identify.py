@@ -10,7 +10,13 @@ import numpy as np
 
 from mjx_revolve.engine.plant import body_geometry
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.fitting.estimate import Model, linearize, normal_equations
+from mjx_revolve.fitting.estimate import (
+    Model,
+    free_information,
+    linearize,
+    normal_equations,
+    prior_matrix,
+)
 from mjx_revolve.fitting.parameters import Parameter
 from mjx_revolve.fitting.problem import NOISE, FitProblem, FitSettings, make_problem
 from mjx_revolve.fitting.recording import RobotRecording, TimeSeries
@@ -170,16 +176,13 @@ def information_of(problem: FitProblem) -> np.ndarray:
     model = linearize(problem, problem.origin())
     if not np.isfinite(model.track).all():
         raise InputError("plan", "motions that can be simulated", "some that diverge")
-    count, own = len(problem.parameters), len(problem.local)
     found = []
     for r in range(len(problem.recordings)):
         kept = [c._replace(fitted=c.fitted & (c.recording == r)) for c in problem.channels]
         # What is simulated is what would be seen.
         zero = Model([0 * x for x in model.values], model.slopes, model.track)
         one = replace(problem, channels=tuple(kept))
-        matrix = normal_equations(one, zero, problem.origin(), NOISE).matrix
-        alone, across, rest = matrix[:count, :count], matrix[:count, count:], matrix[count:, count:]
-        found.append(alone - across @ np.linalg.solve(rest, across.T) if own else alone)
+        found.append(free_information(one, normal_equations(one, zero, problem.origin(), NOISE)))
     return np.array(found)
 
 
@@ -224,7 +227,7 @@ def plan_motions(
     each = information_of(problem)
     parameters = problem.parameters
     total = np.zeros((len(parameters),) * 2) if known is None else known.copy()
-    prior = np.diag([p.spread**-2.0 for p in parameters])
+    prior = prior_matrix(problem)
     chosen: list[PlannedMotion] = []
     spreads = []
     wanted = settings.motions if count is None else count

@@ -18,6 +18,8 @@ from mjx_revolve.fitting.estimate import (
     System,
     correlation,
     costs_of,
+    fitted_by_kind,
+    free_information,
     normal_equations,
     numbers_used,
     prior_matrix,
@@ -45,11 +47,7 @@ def _widened(
 ) -> dict[str, float]:
     """The noise, of kinds with few measurements at least what is left of them."""
     found = dict(noise)
-    for kind in noise:
-        pairs = zip(problem.channels, values, strict=True)
-        many = [left[c.fitted].ravel() for c, left in pairs if c.kind == kind]
-        x = np.concatenate(many)
-        x = x[np.isfinite(x)]
+    for kind, x in fitted_by_kind(problem, values).items():
         if 0 < len(x) < FEW:
             degrees = max(len(x) - len(problem.parameters), 1)
             found[kind] = max(noise[kind], float(np.sqrt(np.sum(x**2) / degrees)))
@@ -97,11 +95,7 @@ def estimate(problem: FitProblem, state: FitState, model: Model) -> Estimate:
     noise = _widened(problem, model.values, noise)
     system = normal_equations(problem, model, state.point, noise)
     covariance = np.linalg.inv(with_prior(problem, system))
-    rest = system.matrix[count:, count:]
-    across = system.matrix[:count, count:]
-    alone = system.matrix[:count, :count]
-    if len(rest):
-        alone = alone - across @ np.linalg.solve(rest, across.T)
+    information = free_information(problem, system)
     rows = sum(
         np.isfinite(left[channel.fitted]).sum() / inflation[channel.kind]
         for channel, left in zip(problem.channels, model.values, strict=True)
@@ -111,9 +105,9 @@ def estimate(problem: FitProblem, state: FitState, model: Model) -> Estimate:
     quantile = float(student.ppf((1 + LEVEL) / 2, degrees))
     return Estimate(
         state.point.free,
-        _profile(problem, state.point, model, system, noise, quantile),
+        _Profile(problem, state.point, model, system, noise, quantile).find_ends(),
         covariance[:count, :count],
-        (alone + alone.T) / 2,
+        (information + information.T) / 2,
         state.point.local,
         np.sqrt(np.diag(covariance)[count:]).reshape(state.point.local.shape),
         {kind: sigma / np.sqrt(inflation[kind]) for kind, sigma in noise.items()},
@@ -121,13 +115,11 @@ def estimate(problem: FitProblem, state: FitState, model: Model) -> Estimate:
     )
 
 
-def _profile(
-    problem: FitProblem, best: Point, model: Model, system: System, noise: dict[str, float],
-    quantile: float,
-) -> np.ndarray:  # fmt: skip
-    """`[P, 2]` ends of intervals, offsets: all of them are looked for at once, in lanes.
+@dataclass(frozen=True)
+class _Profile:
+    """The cost around a solution, least by all numbers but one.
 
-    Args:
+    Attributes:
         problem: that was solved.
         best: its solution.
         model: the problem there.
@@ -135,27 +127,6 @@ def _profile(
         noise: standard deviations by kind, with correlation.
         quantile: standard deviations from a number to its end if all were linear.
     """
-    profile = _Profile(problem, best, model, system, noise, quantile)
-    count = len(problem.parameters)
-    searches = [profile.find_end(k, side) for k in range(count) for side in (-1.0, 1.0)]
-    wanted = {i: next(search) for i, search in enumerate(searches)}
-    ends = np.zeros(len(searches))
-    while wanted:
-        points = [point for many in wanted.values() for point in many]
-        values = iter(profile.simulate(points))
-        tried = {i: [next(values) for _ in many] for i, many in wanted.items()}
-        wanted = {}
-        for i, many in tried.items():
-            try:
-                wanted[i] = searches[i].send(many)
-            except StopIteration as stop:
-                ends[i] = stop.value
-    return np.sort(ends.reshape(count, 2), 1)
-
-
-@dataclass(frozen=True)
-class _Profile:
-    """The cost around a solution, least by all numbers but one; arguments as of `_profile`."""
 
     problem: FitProblem
     best: Point
@@ -163,6 +134,24 @@ class _Profile:
     system: System
     noise: dict[str, float]
     quantile: float
+
+    def find_ends(self) -> np.ndarray:
+        """`[P, 2]` ends of intervals, offsets: all of them are looked for at once, in lanes."""
+        count = len(self.problem.parameters)
+        searches = [self.find_end(k, side) for k in range(count) for side in (-1.0, 1.0)]
+        wanted = {i: next(search) for i, search in enumerate(searches)}
+        ends = np.zeros(len(searches))
+        while wanted:
+            points = [point for many in wanted.values() for point in many]
+            values = iter(self.simulate(points))
+            tried = {i: [next(values) for _ in many] for i, many in wanted.items()}
+            wanted = {}
+            for i, many in tried.items():
+                try:
+                    wanted[i] = searches[i].send(many)
+                except StopIteration as stop:
+                    ends[i] = stop.value
+        return np.sort(ends.reshape(count, 2), 1)
 
     def simulate(self, points: Sequence[Point]) -> list[Values]:
         """Residuals at points."""
@@ -199,7 +188,7 @@ class _Profile:
         linear = quantile * float(np.sqrt(covariance[k, k]))
         still = self.system._replace(starts=[(*x[:4], 0 * x[4]) for x in self.system.starts])
         move = covariance[:, k] * side * linear / covariance[k, k]
-        point = reach(problem, best, still, move, self._undamped)
+        point = reach(problem, best, still, move)
         # Distances, and square roots of twice the cost there: of the farthest that is within the
         # interval, and of the nearest beyond.
         place, inside, outside = linear, (0.0, 0.0), None
@@ -241,10 +230,6 @@ class _Profile:
             place = ahead
         return best.free[k] + side * ahead
 
-    @property
-    def _undamped(self) -> np.ndarray:
-        return np.zeros(self.problem.drive.resets.shape)
-
     def _pick(self, trials: list[Point], tried: list[Values]) -> tuple[Point, Values, float]:
         """Of points that differ in windows' beginnings the best, window by window."""
         problem = self.problem
@@ -271,5 +256,5 @@ class _Profile:
         move[others] = np.linalg.solve(matrix[np.ix_(others, others)], slope[others])
         gain = float(slope @ move) / 2
         gain += sum(float(x[4] @ np.linalg.solve(x[2], x[4])) / 2 for x in now.starts)
-        trials = [reach(self.problem, point, now, move, self._undamped, share) for share in _SHARES]
+        trials = [reach(self.problem, point, now, move, share=share) for share in _SHARES]
         return trials, gain

@@ -46,7 +46,6 @@ class Parameter:
         spread: standard deviation of the prior, of the logarithm where `positive`.
         positive: whether the logarithm is what is fitted.
         entries: value → params by module, type or `all`.
-        usual: a line of what the number is now, for tables; "" where there are several.
     """
 
     name: str

@@ -294,15 +294,9 @@ class FitProblem:
         f = (place - i)[:, None]
         a, b = track[:, k, i], track[:, k, i + 1]
         found = a + f * (b - a)
-        h = self.piece / (count - 1)
-        found[..., :3] += (
-            f
-            * (1 - f)
-            * (
-                (1 - f) * (h * a[..., 7:10] - (b - a)[..., :3])
-                - f * (h * b[..., 7:10] - (b - a)[..., :3])
-            )
-        )
+        h, way = self.piece / (count - 1), (b - a)[..., :3]
+        early, late = (h * x[..., 7:10] - way for x in (a, b))
+        found[..., :3] += f * (1 - f) * ((1 - f) * early - f * late)
         found[..., 3:7] /= np.linalg.norm(found[..., 3:7], axis=-1, keepdims=True)
         # Acceleration, for accelerometers, behind the state.
         push = (b - a)[..., 7:10] / h
@@ -377,7 +371,8 @@ def make_problem(
     resets = np.zeros((windows, len(recordings)), bool)
     short = resets.copy()
     for r, view in enumerate(views):
-        whole = held[r] or view.loose
+        # Without attitude, nothing says how to begin again.
+        whole = held[r] or view.quat is None
         many = 1 if whole else max(1, int(usual[r] / piece / _PARTS + 0.25))
         resets[: many * _PARTS : _PARTS, r] = True
         short[: 1 if whole else max(1, int(usual[r] / piece + 0.25)), r] = True
@@ -407,7 +402,7 @@ def make_problem(
     return FitProblem(
         robot, tuple(parameters), local, tuple(recordings), settings, begin, end, until, piece,
         every, drive, roots, spread, tuple(channels), variants,
-        np.array([v.heading is None for v in views]), commands, short,
+        np.array([v.quat is None for v in views]), commands, short,
     )  # fmt: skip
 
 
@@ -478,8 +473,7 @@ def _commands(
         if name in prescribed:
             signal = recording.signals[f"angle.{name}"]
             course = _course(signal, begin + dt * np.arange(-1, count + 1))
-            targets = course_targets(course, dt)
-            columns.append(_constant(targets))
+            columns.append(_constant(course_targets(course, dt)))
         else:
             columns.append(_held(recording, f"command.{name}", edges, dt))
     columns += [_held(recording, f"command.{name}", edges, dt, True) for name in jets]
@@ -558,9 +552,6 @@ class _View:
             times += [s.time for n, s in signals.items() if n.startswith(("command.", "angle."))]
         self.begin = min(float(t[0]) for t in times)
         self.end = max(float(t[-1]) for t in times)
-        self.heading = self.quat
-        # Without attitude, nothing says how to begin again.
-        self.loose = self.quat is None
 
     def check_frames(self, window: float) -> None:
         """Refuses a recording of which a window has no two frames."""
@@ -707,13 +698,9 @@ class _View:
 
 def _turn_error(quat: np.ndarray, seen: np.ndarray, level: bool) -> np.ndarray:
     """`[V, n, 3]` rotation θ from seen to simulated, 2 sin(θ/2), or `[V, n, 1]` about z [rad]."""
-    w, v = seen[:, :1], -seen[:, 1:]
-    real = w[:, 0] * quat[..., 0] - np.sum(v * quat[..., 1:], -1)
-    imaginary = (
-        w * quat[..., 1:]
-        + quat[..., :1] * v
-        + np.cross(np.broadcast_to(v, quat[..., 1:].shape), quat[..., 1:])
-    )
+    w, v, turned = seen[:, :1], -seen[:, 1:], quat[..., 1:]
+    real = w[:, 0] * quat[..., 0] - np.sum(v * turned, -1)
+    imaginary = w * turned + quat[..., :1] * v + np.cross(v, turned)
     if level:
         yaw = 2 * np.arctan2(imaginary[..., 2], real)
         return ((yaw + np.pi) % (2 * np.pi) - np.pi)[..., None]

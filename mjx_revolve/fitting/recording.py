@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjx_revolve.engine.plant import body_geometry
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.inputs.errors import InputError, reading, show
 from mjx_revolve.inputs.files import check_path, read_file
@@ -125,12 +126,9 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
     path = check_path(path)
     if not path.exists():
         raise InputError(path, "a CSV, an MCAP, a ROS 2 bag or a run folder", "none")
-    marks = {
-        key.removeprefix("mark."): _read_mark(key, source, robot)
-        for key, source in columns.items()
-        if key.startswith("mark.") and key.count(".") == 1
-    }
-    rest = {k: v for k, v in columns.items() if not (k.startswith("mark.") and k.count(".") == 1)}
+    points = [key for key in columns if key.startswith("mark.") and key.count(".") == 1]
+    marks = {key.removeprefix("mark."): _read_mark(key, columns[key], robot) for key in points}
+    rest = {key: source for key, source in columns.items() if key not in points}
     unused: list[str] = []
     with reading(path):
         if path.is_dir() and (path / "run.json").is_file():
@@ -139,8 +137,8 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
             signals = _read_bag(path, rest)
         else:
             signals, unused = _read_csv(path, rest, robot)
-        signals, marks = _name_marks(signals, marks, robot)
-        signals, notes = _check_signals(signals, robot)
+        _add_marks(marks, signals, robot)
+        notes = _check_signals(signals, robot)
     uncommanded = [m.name for m in robot.morphology.modules if m.kind.hinge or m.kind.is_thruster]
     uncommanded = [n for n in uncommanded if not {f"command.{n}", f"angle.{n}"} & set(signals)]
     if uncommanded:
@@ -364,11 +362,8 @@ def _array(message: Any, topic: str) -> Iterable[tuple[str, float]]:
 
 
 def _imu(message: Any, topic: str) -> Iterable[tuple[str, float]]:
-    for kind, vector in (
-        ("gyro", message.angular_velocity),
-        ("accel", message.linear_acceleration),
-    ):
-        yield from ((f"{kind}.{axis}", getattr(vector, axis)) for axis in "xyz")
+    yield from ((f"gyro.{axis}", getattr(message.angular_velocity, axis)) for axis in "xyz")
+    yield from ((f"accel.{axis}", getattr(message.linear_acceleration, axis)) for axis in "xyz")
 
 
 def _point(message: Any, topic: str) -> Iterable[tuple[str, float]]:
@@ -415,15 +410,13 @@ def _read_run(path: Path) -> dict[str, TimeSeries]:
 # --- checks ---------------------------------------------------------------------------------------
 
 
-def _name_marks(
-    signals: dict[str, TimeSeries], marks: dict[str, MarkedPoint], robot: Robot
-) -> tuple[dict[str, TimeSeries], dict[str, MarkedPoint]]:
-    """Marks as the signals have them; those that nothing says a place of are refused."""
+def _add_marks(
+    marks: dict[str, MarkedPoint], signals: Mapping[str, TimeSeries], robot: Robot
+) -> None:
+    """Adds marks named after modules; those without a place or without a signal are refused."""
+    modules = [m.name for m in robot.morphology.modules]
     seen = {name.split(".")[1] for name in signals if name.startswith("mark.")}
-    for name in sorted(seen):
-        if name in marks:
-            continue
-        modules = [m.name for m in robot.morphology.modules]
+    for name in sorted(seen - marks.keys()):
         if name not in modules:
             raise InputError(
                 f"mark {name}: expected where it is (--map mark.{name}=MODULE:X,Y,Z [m], of the "
@@ -433,12 +426,9 @@ def _name_marks(
     for name in marks:
         if name not in seen:
             raise InputError(f"mark {name}", f"columns mark.{name}.x and .y", "none")
-    return signals, marks
 
 
-def _check_signals(
-    signals: dict[str, TimeSeries], robot: Robot
-) -> tuple[dict[str, TimeSeries], list[str]]:
+def _check_signals(signals: Mapping[str, TimeSeries], robot: Robot) -> list[str]:
     """Plain faults, one line each; and notes about gaps."""
     modules = {m.name: m.kind for m in robot.morphology.modules}
     seen = [n for n in signals if n in _POSE or n in _SENSED or n.startswith("mark.")]
@@ -483,8 +473,8 @@ def _check_signals(
                     f"{name}: expected commands within {list(jet.range)}; found {most:.3g}: "
                     f"percent? (--map {name}=COLUMN*0.01)"
                 )
-    if all(f"q{axis}" in signals for axis in "wxyz"):
-        length = np.sqrt(sum(np.median(signals[f"q{a}"].value ** 2) for a in "wxyz"))
+    if all(name in signals for name in quat):
+        length = np.sqrt(sum(np.median(signals[name].value ** 2) for name in quat))
         if not 0.5 < length < 1.5:
             raise InputError("qw, qx, qy, qz", "unit quaternions", f"length {length:.3g}")
     for name in ("roll", "pitch", "yaw"):
@@ -499,12 +489,12 @@ def _check_signals(
                 )
     _check_motion(signals, robot)
     frames = {n: signals[n] for n in seen}
-    return signals, [*_gaps(frames), *_sampled_commands(signals, frames, robot)]
+    return [*_gaps(frames), *_sampled_commands(signals, frames, robot)]
 
 
 def _check_motion(signals: Mapping[str, TimeSeries], robot: Robot) -> None:
     """Refuses what is too fast for its units, jumps, flies, and what does not move at all."""
-    length, top = _length(robot), robot.world.surface_height
+    length, top = float(body_geometry(robot).length), robot.world.surface_height
     for name in (n for n in signals if n == "z" or (n.startswith("mark.") and n.endswith(".z"))):
         middle = float(np.median(signals[name].value))
         if middle > top + length:
@@ -551,12 +541,6 @@ def _check_jump(name: str, signal: TimeSeries, length: float) -> None:
                 f"{name}: expected a way without jumps; found one of {abs(step[k - 1]):.3g} m at "
                 f"{time[k]:g} s: another origin, or another robot, from there on?"
             )
-
-
-def _length(robot: Robot) -> float:
-    from mjx_revolve.engine.plant import body_geometry
-
-    return float(body_geometry(robot).length)
 
 
 def _sampled_commands(

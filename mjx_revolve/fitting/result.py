@@ -13,7 +13,7 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.fitting.estimate import FitState, Model, advance, begin, linearize
 from mjx_revolve.fitting.identify import Unknown, find_unknown, is_found, plan_motions
 from mjx_revolve.fitting.intervals import LEVEL, Estimate, estimate
-from mjx_revolve.fitting.parameters import entries_of, with_values
+from mjx_revolve.fitting.parameters import entries_of, split_free, with_values
 from mjx_revolve.fitting.problem import FitProblem, FitSettings, make_problem
 from mjx_revolve.fitting.recording import RobotRecording
 from mjx_revolve.inputs.yaml_reader import dump_yaml
@@ -221,7 +221,7 @@ def conclude(
     )
     advice = ""
     if advise:
-        own = [name for name in free if name not in ("current", "clock")]
+        own, _ = split_free(free)
         plan = plan_motions(problem.robot, own, problem.settings, found.information, 1)
         spread = np.array([p.spread for p in problem.parameters])
         now = np.sqrt(np.diag(found.covariance)) / spread
@@ -239,28 +239,23 @@ def conclude(
 def _predict(problem: FitProblem, state: FitState) -> tuple[Prediction, ...]:
     now = [state.point]
     tracks = np.concatenate([problem.simulate(now), problem.simulate(now, unchanged=True)])
-    left = dict(zip(range(len(problem.channels)), problem.residuals(tracks), strict=True))
     found = []
-    for r, recording in enumerate(problem.recordings):
-        for k, channel in enumerate(problem.channels):
-            if channel.recording != r or channel.kind not in ("position", "marks", "speed"):
-                continue
-            off = left[k]
-            if channel.kind == "speed":
-                mean = float(np.mean(recording.signals["mean_speed"].value))
-                none = np.full_like(off, np.nan)
-                both = list(np.concatenate([mean * np.exp(off), none, none], -1))
-                seen = np.tile([mean, np.nan, np.nan], (len(channel.time), 1))
-            else:
-                # The middle of the marks that are seen.
-                wide = np.stack([channel.seen + x for x in (0 * off[0], *off)])
-                wide = wide.reshape(*wide.shape[:2], -1, 3)
-                count = np.isfinite(wide).sum(2)
-                seen, *both = np.where(count > 0, np.nansum(wide, 2) / np.maximum(count, 1), np.nan)
-            found.append(
-                Prediction(
-                    recording.name, channel.time, ~channel.fitted, seen, both[0], both[1],
-                    channel.kind == "speed",
-                )
-            )  # fmt: skip
+    for channel, off in zip(problem.channels, problem.residuals(tracks), strict=True):
+        if channel.kind not in ("position", "marks", "speed"):
+            continue
+        recording = problem.recordings[channel.recording]
+        if channel.kind == "speed":
+            mean = float(np.mean(recording.signals["mean_speed"].value))
+            none = np.full_like(off, np.nan)
+            both = list(np.concatenate([mean * np.exp(off), none, none], -1))
+            seen = np.tile([mean, np.nan, np.nan], (len(channel.time), 1))
+        else:
+            # The middle of the marks that are seen.
+            wide = np.stack([channel.seen + x for x in (0 * off[0], *off)])
+            wide = wide.reshape(*wide.shape[:2], -1, 3)
+            count = np.isfinite(wide).sum(2)
+            seen, *both = np.where(count > 0, np.nansum(wide, 2) / np.maximum(count, 1), np.nan)
+        is_speed = channel.kind == "speed"
+        row = recording.name, channel.time, ~channel.fitted, seen, both[0], both[1], is_speed
+        found.append(Prediction(*row))
     return tuple(sorted(found, key=lambda p: not p.held.all()))

@@ -116,8 +116,7 @@ def load_robot(
     copies: dict[str, bytes] = {}
     entry: dict[str, Any] = {"robot": "inputs/robot.yaml", "world": world}
     if Path(world).is_file():
-        for file, content in read_world_files(world).items():
-            copies[file] = content
+        copies |= read_world_files(world)
         entry["world"] = f"inputs/{Path(world).name}"
     if modules is not None:
         copies["modules.yaml"] = read_file(modules)
@@ -222,9 +221,7 @@ class FitRun:
         """A checkpoint of the state."""
         state = self.state
         assert state is not None
-        point = state.point
-        arrays = {"free": point.free, "local": point.local, "starts": point.starts,
-                  "damping": state.damping, "roots": self.problem.roots,
+        arrays = {**vars(state.point), "damping": state.damping, "roots": self.problem.roots,
                   "resets": self.problem.drive.resets}  # fmt: skip
         if state.steps is not None:
             arrays["steps"] = state.steps
@@ -233,11 +230,11 @@ class FitRun:
 
     def run(self, interrupts: Interrupts) -> Fit | None:
         """Goes on to the end; None where a signal came before."""
-        total = self.request.settings.iterations
         if self.state is None:
             self.state = begin(self.problem, self.request.seed)
             self.save()
         self.model = linearize(self.problem, self.state.point, self.state.steps)
+        total = self.problem.settings.iterations
         progress = _Progress(self.state.iteration, total, unit="iteration")
         try:
             while not is_done(self.problem, self.state):

@@ -311,11 +311,8 @@ def describe_brain(brain: Brain) -> tuple[str, list[str], list[str]]:
         text += f", {sensor.delay:g} s late" if sensor.delay else ""
         words.append(text)
     interface = ["Sensors:"]
-    names = list(brain.commands[: brain.num_hinges])
-    for signal in brain.signals:
-        text = f"- {signal.name} [{signal.size}], {signal.unit}: {signal.words}"
-        interface.append(text)
-    if any(signal.size == len(names) > 1 for signal in brain.signals):
+    interface += [f"- {s.name} [{s.size}], {s.unit}: {s.words}" for s in brain.signals]
+    if any(signal.size == brain.num_hinges > 1 for signal in brain.signals):
         interface.append("Hinges are in the order of the commands.")
     interface += ["Commands, within low and high:"]
     for k, name in enumerate(brain.commands):

@@ -14,10 +14,7 @@ _TYPES = {"real": "brain_real", "int": "int32_t", "bool": "bool"}
 
 # Functions, by name: only those that are used are written.
 _FUNCTIONS = {
-    "brain_max": (
-        "brain_real a, brain_real b",
-        "(a > b || a != a) ? a : b",
-    ),
+    "brain_max": ("brain_real a, brain_real b", "(a > b || a != a) ? a : b"),
     "brain_min": ("brain_real a, brain_real b", "(a < b || a != a) ? a : b"),
     "brain_square": ("brain_real a", "a * a"),
     "brain_sign": ("brain_real a", "a > 0 ? 1 : a < 0 ? -1 : a"),
@@ -26,13 +23,11 @@ _FUNCTIONS = {
 
 class _CCode(Code):
     language = "c"
+    table_prefix = "c"
 
     def literal(self, x: np.generic) -> str:
         text = _number(x)
         return f"((brain_real){text})" if isinstance(x, np.floating) else f"({text})"
-
-    def table_name(self, count: int) -> str:
-        return f"c{count}"
 
     def input_name(self, value: Value) -> str:
         if value.label == "time":

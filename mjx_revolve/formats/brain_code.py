@@ -36,11 +36,13 @@ class Code(ABC):
 
     Attributes:
         language: field of the forms that it writes.
+        table_prefix: of the names of tables, before their numbers.
         constants: name and value of the tables that the lines use.
         lines: of the step.
     """
 
     language: Literal["numpy", "c"]
+    table_prefix: str
 
     def __init__(self, program: Program) -> None:
         self.program = program
@@ -144,17 +146,13 @@ class Code(ABC):
         assert data is not None
         key = data.dtype.str, data.tobytes()
         if key not in self._tables:
-            self._tables[key] = self.table_name(len(self._tables))
+            self._tables[key] = f"{self.table_prefix}{len(self._tables)}"
             self.constants[self._tables[key]] = data
         return self._tables[key]
 
     @abstractmethod
     def literal(self, x: np.generic) -> str:
         """A number."""
-
-    @abstractmethod
-    def table_name(self, count: int) -> str:
-        """The name of another table of constants."""
 
     @abstractmethod
     def input_name(self, value: Value) -> str:

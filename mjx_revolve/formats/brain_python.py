@@ -17,13 +17,11 @@ _DTYPES = {"real": "REAL", "int": "np.int32", "bool": "bool"}
 
 class _PythonCode(Code):
     language = "numpy"
+    table_prefix = "_C"
 
     def literal(self, x: np.generic) -> str:
         text = _number(x)
         return text if not text.startswith("-") else f"({text})"
-
-    def table_name(self, count: int) -> str:
-        return f"_C{count}"
 
     def input_name(self, value: Value) -> str:
         return value.label
@@ -103,13 +101,11 @@ def make_brain_python(brain: Brain) -> str:
         filled = f"np.full({value.size}, {_number(data[0])}, {_DTYPES[value.kind]})"
         whole = f"np.array({array_text(data, _number)}, {_DTYPES[value.kind]})"
         start.append(filled if (data == data[0]).all() else whole)
-    labels = [value.label for value in states]
-    inputs = [f"{s.name} = _read(sensors, {s.name!r})" for s in brain.signals]
+    body = [f"{s.name} = _read(sensors, {s.name!r})" for s in brain.signals]
     if brain.time in program.live:
-        inputs.insert(0, "time = np.asarray(time, REAL).reshape(1)")
-    body = [*inputs]
+        body.insert(0, "time = np.asarray(time, REAL).reshape(1)")
     if states:
-        body.append(f"({', '.join(labels)},) = self.state")
+        body.append(f"({', '.join(value.label for value in states)},) = self.state")
     body += code.lines
     if states:
         after = [code.name_of(program.after[k]) for k in code.live_states]

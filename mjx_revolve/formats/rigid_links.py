@@ -269,10 +269,8 @@ def _inertial(element: Element, place: Place) -> np.ndarray:
     position, rotation = _then(place, _origin(element))
     mass = _numbers(element.find("mass"), "value", 1, None)[0]
     entries = element.find("inertia")
-    values = {
-        k: _numbers(entries, k, 1, "0")[0] for k in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-    }
-    x, y, z, xy, xz, yz = values.values()
+    names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    x, y, z, xy, xz, yz = (_numbers(entries, name, 1, "0")[0] for name in names)
     return _spread(mass, position, rotation, np.array([[x, xy, xz], [xy, y, yz], [xz, yz, z]]))
 
 
@@ -364,14 +362,12 @@ def _urdf_hinge(joint: Element, missing: list[str]) -> _Hinge | None:
         missing.append(f"{name}: damping and friction; here those of our servos")
     limit = joint.find("limit")
     limits: dict[str, Any] = {}
-    if limit is not None:
-        for ours, theirs in (("effort", "effort"), ("speed", "velocity")):
-            value = _numbers(limit, theirs, 1, "0")[0]
-            if value > 0:
-                limits[ours] = value
+    for ours, theirs in (("effort", "effort"), ("speed", "velocity")):
+        value = _numbers(limit, theirs, 1, "0")[0]
+        if value > 0:
+            limits[ours] = value
     if kind == "revolute":
-        ends = [_numbers(limit, end, 1, "0")[0] for end in ("lower", "upper")]
-        limits["range"] = ends
+        limits["range"] = [_numbers(limit, end, 1, "0")[0] for end in ("lower", "upper")]
     return _numbers(joint.find("axis"), "xyz", 3, "1 0 0"), np.zeros(3), limits
 
 
@@ -453,7 +449,7 @@ def _mjcf_hinge(model: mujoco.MjModel, body: int, missing: list[str]) -> tuple[_
                            "here, as a link has one hinge")  # fmt: skip
     if not hinges:
         return None, ""
-    [j] = hinges[:1]
+    j = hinges[0]
     limits: dict[str, Any] = {}
     if model.jnt_limited[j]:
         limits["range"] = (model.jnt_range[j] - model.qpos0[model.jnt_qposadr[j]]).tolist()
