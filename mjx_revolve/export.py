@@ -55,10 +55,7 @@ def _parser() -> argparse.ArgumentParser:
         prog=program("export"),
         description="Write a champion, or a morphology, for MuJoCo, ROS, Gazebo and the bench: all "
         "formats into a folder, or those that are given a file.",
-        examples=(
-            "export runs/mine",
-            "export spider --mjcf spider.xml",
-        ),
+        examples=("export runs/mine", "export spider --mjcf spider.xml"),
     )
     add_episode_arguments(parser)
     for name, (_, endings, words) in _FORMATS.items():

@@ -79,7 +79,7 @@ class Morphology:
         named = [k.name if MODULES.get(k.name) is k else k for k in kinds.values()]
         place = np.concatenate([x for m in self.modules for x in (m.position, *m.rotation)])
         head = (self.name, self.brain, self.path, self.overlaps, self.sensors)
-        return _unpack, (*head, rows, named, place.tobytes())
+        return _unpack, (head, rows, named, place.tobytes())
 
     @property
     def num_modules(self) -> int:
@@ -247,16 +247,7 @@ class Morphology:
         save_morphology(self, path)
 
 
-def _unpack(
-    name: str,
-    brain: object,
-    path: str | None,
-    overlaps: tuple[tuple[str, str], ...],
-    sensors: tuple[Sensor, ...] | None,
-    rows: list[Any],
-    named: list[Any],
-    place: bytes,
-) -> Morphology:
+def _unpack(head: tuple[Any, ...], rows: list[Any], named: list[Any], place: bytes) -> Morphology:
     """The inverse of `Morphology.__reduce__`."""
     kinds = [MODULES[kind] if isinstance(kind, str) else kind for kind in named]
     places = np.frombuffer(place).reshape(-1, 4, 3)
@@ -266,7 +257,8 @@ def _unpack(
             rows, places, strict=True
         )
     ]
-    return Morphology(name, tuple(modules), brain, path, overlaps, sensors)
+    name, *rest = head
+    return Morphology(name, tuple(modules), *rest)
 
 
 def free_name(stem: str, taken: Collection[str], first: int = 2) -> str:

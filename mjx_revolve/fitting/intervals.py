@@ -222,11 +222,8 @@ class _Profile:
             if outside is not None:
                 ahead = min(max(ahead, a + 0.2 * (b - a)), a + 0.9 * (b - a))
             far = ahead / place
-            point = Point(*(
-                x + far * (y - x) for x, y in (
-                    (best.free, point.free), (best.local, point.local), (best.starts, point.starts)
-                )
-            ))  # fmt: skip
+            pairs = zip(vars(best).values(), vars(point).values(), strict=True)
+            point = Point(*(x + far * (y - x) for x, y in pairs))
             place = ahead
         return best.free[k] + side * ahead
 

@@ -112,11 +112,8 @@ class Fit:
     @property
     def coefficients(self) -> dict[str, dict[str, Any]]:
         """Params by type of module, module or `all`, as `body.coefficients` reads them."""
-        problem = self.problem
-        found: dict[str, dict[str, Any]] = _plain(
-            entries_of(problem.robot, problem.parameters, self.state.point.free)
-        )
-        return found
+        problem, free = self.problem, self.state.point.free
+        return _plain(entries_of(problem.robot, problem.parameters, free))
 
     def to_yaml(self) -> str:
         """The file of coefficients that morphologies and configurations name."""

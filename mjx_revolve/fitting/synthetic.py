@@ -40,10 +40,8 @@ def simulate_signals(
     dt = robot.world.timestep
     count = round(duration / dt) if ctrl is None else len(ctrl)
     time = dt * np.arange(count + 1)
-    signals = {
-        name: TimeSeries(time[[0, -1]], np.zeros(2))
-        for name in ("x", "y", "z", "yaw", "roll", "pitch")
-    }
+    still = TimeSeries(time[[0, -1]], np.zeros(2))
+    signals = dict.fromkeys(("x", "y", "z", "yaw", "roll", "pitch"), still)
     commands = {}
     if ctrl is not None:
         for k in range(robot.mj_model.nu):
