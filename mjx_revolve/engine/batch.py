@@ -33,6 +33,7 @@ from mjx_revolve.engine.step_constants import (
 )
 from mjx_revolve.engine.thrusters import curve_points, read_thrusters
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.numerics.spatial import UNIT
 from mjx_revolve.water.drag import drags_whole_bodies
 from mjx_revolve.water.laws import part_fields
 from mjx_revolve.water.world import World
@@ -495,7 +496,6 @@ def _constants(level: Level, kinds: Sequence[ModuleType], hinges: bool, world: W
     blank: Level = jax.tree.map(lambda _: None, level)
     if _is_square(kinds):
         # Such parts stand square on their bodies and are described along their axes.
-        unit = tuple(tuple(float(i == j) for j in range(3)) for i in range(3))
         groups = []
         for parts in blank.parts:
             carried = parts.carried
@@ -505,8 +505,8 @@ def _constants(level: Level, kinds: Sequence[ModuleType], hinges: bool, world: W
                     cross=cross, linear=(None, 0.0, 0.0, None, 0.0, None)
                 )
                 carried = replace(carried, inertia=about)
-            groups.append(replace(parts, rotation=unit, carried=carried))
-        shells = blank.shells and replace(blank.shells, rotation=unit)
+            groups.append(replace(parts, rotation=UNIT, carried=carried))
+        shells = blank.shells and replace(blank.shells, rotation=UNIT)
         blank = replace(blank, parts=tuple(groups), shells=shells)
     # Where neighbours meet, hinges of one type end at different angles.
     ends = level.hinges is not None and world.self_contact

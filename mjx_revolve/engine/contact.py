@@ -16,16 +16,20 @@ from mjx_revolve.engine.level import Level, Points
 from mjx_revolve.numerics.inertia import BodyMotion, SpatialInertia, apply_inertia, sum_parts
 from mjx_revolve.numerics.spatial import (
     SYM,
+    ZERO,
     Mat,
     Scalar,
     Sym,
     Vec,
     add,
     cross,
+    diagonal,
     dot,
     full,
+    madd,
     matmul,
     matTvec,
+    mscale,
     mul,
     neg,
     skew,
@@ -153,7 +157,7 @@ def bed_forces(
     damping = _damping(points.position, normal, stiff - grip, grip, gather)
     # What the damping acts on is the acceleration relative to the bed, not to the water.
     gust = vscale(world.timestep, matTvec(motion.axes, water.acceleration))
-    gust_torque, gust_force = apply_inertia(damping, (0.0, 0.0, 0.0), gust)
+    gust_torque, gust_force = apply_inertia(damping, ZERO, gust)
     return (
         vsub(tuple(gather(x) for x in torque), gust_torque),
         vsub(tuple(gather(x) for x in force), gust_force),
@@ -221,11 +225,11 @@ def _damping(
         sums.append((gather(weight), first, second))
     (b, br, brr), (a, ar, arr) = sums
     outer = tuple(mul(normal[i], normal[j]) for i, j in SYM)
-    unit = (1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
+    unit = diagonal((1.0, 1.0, 1.0))
     linear = tuple(add(mul(b, u), mul(a, o)) for u, o in zip(unit, outer, strict=True))
     # Σ [r] (b 1 + a n nᵀ) and -Σ [r] (b 1 + a n nᵀ) [r].
     nn = full(outer)
-    across = tuple(vadd(p, q) for p, q in zip(skew(br), matmul(skew(ar), nn), strict=True))
+    across = madd(skew(br), matmul(skew(ar), nn))
     trace = total(brr[0], brr[3], brr[5])
     angular = tuple(
         add(sub(mul(u, trace), s), t)
@@ -237,5 +241,5 @@ def _damping(
 def _turned(moment: Mat, normal: Vec) -> Sym:
     """Σ a (r × n)(r × n)ᵀ from Σ a r rᵀ: [n] M [n]ᵀ."""
     x = skew(normal)
-    turned = matmul(matmul(x, moment), tuple(tuple(neg(e) for e in row) for row in x))
+    turned = matmul(matmul(x, moment), mscale(-1.0, x))
     return tuple(turned[i][j] for i, j in SYM)

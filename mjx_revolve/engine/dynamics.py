@@ -46,6 +46,8 @@ from mjx_revolve.numerics.inertia import (
     scale_inertia,
 )
 from mjx_revolve.numerics.spatial import (
+    NO_MATRIX,
+    ZERO,
     Scalar,
     Vec,
     add,
@@ -68,11 +70,9 @@ from mjx_revolve.numerics.xla import take_lanes
 from mjx_revolve.water.flow import Water, needs_horizontal_position
 from mjx_revolve.water.world import World
 
-_NO_MATRIX = ((0.0,) * 3,) * 3
-_NO_BLOCK = Block(_NO_MATRIX, _NO_MATRIX, _NO_MATRIX, _NO_MATRIX)
-_NO_BIAS = ((0.0,) * 3, (0.0,) * 3)
+_NO_BLOCK = Block(NO_MATRIX, NO_MATRIX, NO_MATRIX, NO_MATRIX)
 # The hinge's axis in its body's frame, (angular, linear).
-_AXIS = ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+_AXIS = ((0.0, 0.0, 1.0), ZERO)
 
 
 def accelerate(
@@ -170,7 +170,7 @@ def accelerate(
 
     children, saved, power = tree.backward_pass(
         articulate,
-        (_flatten(_NO_BLOCK, _NO_BIAS, symmetric), 0.0),
+        (_flatten(_NO_BLOCK, (ZERO, ZERO), symmetric), 0.0),
         moved, state.angle, state.speed, targets, *state.submerged[1:], *wrench[1:],
     )  # fmt: skip
     whole, submerged, _ = articulate(

@@ -8,7 +8,6 @@ own has the world's.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,7 +25,7 @@ from mjx_revolve.water.drag import DRAG_LAWS
 from mjx_revolve.water.face_drag import beside, split_axes
 from mjx_revolve.water.fin_wake import FIN_WAKE
 from mjx_revolve.water.law_names import list_coefficients
-from mjx_revolve.water.laws import Coefficient
+from mjx_revolve.water.laws import Coefficient, PartShapes
 from mjx_revolve.water.lift_drag import LIFT_DRAG
 from mjx_revolve.water.mujoco_drag import ELLIPSOID, INERTIA_BOX
 from mjx_revolve.water.plate_wake import PLATE_WAKE, thinness
@@ -36,32 +35,21 @@ _ZERO_MATRIX = ((0.0,) * 6,) * 6
 
 
 @dataclass(frozen=True, eq=False)
-class FluidTable:
+class FluidTable(PartShapes):
     """Tables of the parts of a robot, or of several one behind the other; NumPy, never traced.
 
-    It is what laws take their numbers from: `laws.PartShapes`.
+    What laws take their numbers from is in `laws.PartShapes`.
 
     Attributes:
         body: MuJoCo body that carries the part.
         module: module of the morphology.
         position: centre of the part's box, body frame [m].
         rotation: body from part.
-        half_size: half edges of the box [m].
         center_of_volume: centre of the displaced volume, part frame [m].
         volume: displaced volume: tabulated mesh volume, electronics and ballast [m³].
         mass: [kg].
-        silhouette: area of the part's boxes together, seen along each axis [m²].
-        exposed: share of each pair of faces that the water reaches [-].
-        joined: share that neighbours cover of the ends by which the part is in a row of parts [-];
-            1 of a part that is a row by itself.
-        ends: 1 or -1 along each axis where a row of parts ends with this part, in that direction;
-            else 0.
-        rows: length of that row [m].
         buoyancy: names of the buoyancy laws.
         drag: names of the drag laws.
-        coefficients: `[npart]` each, or `[npart, 3]`: every coefficient of the laws, by name.
-        parameters: `[npart]` each: the parameters of laws that have a class of them.
-        factors: `[npart]` each: the parts' own factors on what laws vary, by name.
         added_mass: of the envelope's exposed faces, or as stated, per unit density, part frame
             [m³].
         added_inertia: the same about the axes [m⁵].
@@ -80,20 +68,11 @@ class FluidTable:
     module: Int[np.ndarray, " npart"]
     position: Float[np.ndarray, "npart 3"]
     rotation: Float[np.ndarray, "npart 3 3"]
-    half_size: Float[np.ndarray, "npart 3"]
     center_of_volume: Float[np.ndarray, "npart 3"]
     volume: Float[np.ndarray, " npart"]
     mass: Float[np.ndarray, " npart"]
-    silhouette: Float[np.ndarray, "npart 3"]
-    exposed: Float[np.ndarray, "npart 3"]
-    joined: Float[np.ndarray, "npart 3"]
-    ends: Float[np.ndarray, "npart 3"]
-    rows: Float[np.ndarray, "npart 3"]
     buoyancy: tuple[str, ...]
     drag: tuple[str, ...]
-    coefficients: Mapping[str, Float[np.ndarray, "npart ..."]]
-    parameters: Mapping[str, tuple[Any, ...]]
-    factors: Mapping[str, Float[np.ndarray, " npart"]]
     added_mass: Float[np.ndarray, "npart 3"]
     added_inertia: Float[np.ndarray, "npart 3"]
     carried_mass: Float[np.ndarray, "npart 3"]

@@ -22,6 +22,7 @@ from mjx_revolve.engine.tree import Tree
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.numerics.inertia import BodyMotion
 from mjx_revolve.numerics.spatial import (
+    ZERO,
     Scalar,
     Vec,
     add,
@@ -33,8 +34,6 @@ from mjx_revolve.numerics.spatial import (
     vsub,
 )
 from mjx_revolve.water.flow import Water
-
-_ZERO = (0.0, 0.0, 0.0)
 
 
 def _in_current(tree: Tree, state: State, water: Water) -> tuple[BodyMotion, Any]:
@@ -103,7 +102,7 @@ def external_force(tree: Tree, state: State, water: Water, thrusts: Any) -> tupl
         gravity = effective_gravity(world, water, motion)
         before = PreviousStep(submerged[0], 0.0) if submerged else None
         external = water_forces(world, level, motion, gravity, water, thrusts, before)
-        bed: Vec = _ZERO
+        bed: Vec = ZERO
         if level.points is not None:
             bed = bed_forces(world, level, motion, level.points, still)[1]
         wide = lambda x: add(x, jnp.zeros_like(motion.height))  # noqa: E731
@@ -112,7 +111,7 @@ def external_force(tree: Tree, state: State, water: Water, thrusts: Any) -> tupl
         )
         return (), (), turned
 
-    below = tree.backward_pass(forces, ((), (_ZERO, _ZERO)), moved, *state.submerged[1:])[2]
+    below = tree.backward_pass(forces, ((), (ZERO, ZERO)), moved, *state.submerged[1:])[2]
     whole = forces(tree.root, None, (root, None), *state.submerged[:1])[2]
     own = jax.tree.map(lambda x: x[0], whole)
     bed, wet = jax.tree.map(add, own, below)
@@ -144,7 +143,7 @@ def contact_force(
 
     def forces(level: Level, children: Any, moved: tuple[BodyMotion, Any], *xs: Any) -> Any:
         given, size = list(xs), jnp.zeros((level.count, *like.shape), like.dtype)
-        push = given.pop(0)[1] if wrench else _ZERO
+        push = given.pop(0)[1] if wrench else ZERO
         press = add(given.pop() if given else 0.0, children[3] if children else 0.0)
         if level.points is not None:
             push = vadd(push, bed_forces(tree.world, level, moved[0], level.points, still)[1])
@@ -165,7 +164,7 @@ def contact_force(
 
 def _without_gust(water: Water) -> Water:
     """Water for the bed's force as it is, without what the step foresees of a gust."""
-    return water._replace(acceleration=_ZERO)
+    return water._replace(acceleration=ZERO)
 
 
 def contact_by_half(

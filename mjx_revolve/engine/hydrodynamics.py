@@ -21,15 +21,19 @@ from mjx_revolve.numerics.inertia import (
     SpatialInertia,
     add_inertia,
     apply_inertia,
+    diagonal_inertia,
     shift_inertia,
     sum_parts,
 )
 from mjx_revolve.numerics.spatial import (
+    NO_MATRIX,
+    ZERO,
     Scalar,
     Sym,
     Vec,
     add,
     cross,
+    diagonal,
     dot,
     is_present,
     matTvec,
@@ -55,7 +59,6 @@ from mjx_revolve.water.laws import NO_DRAG, BodyDragLaw, PartDragLaw, PartFlow
 from mjx_revolve.water.near_surface import NearSurface, near_surface, turning_share
 from mjx_revolve.water.world import World
 
-_ZERO = (0.0, 0.0, 0.0)
 Sum = Callable[[Scalar], Scalar]
 
 
@@ -154,7 +157,7 @@ def _stream(world: World, water: Water, motion: BodyMotion, position: Vec) -> _S
     """The water's motion at points of the bodies, relative to the uniform current."""
     if is_uniform(world):
         return _Stream(None, None)
-    rest = water._replace(current=_ZERO, acceleration=_ZERO)
+    rest = water._replace(current=ZERO, acceleration=ZERO)
     point = _world_position(motion, position)
     velocity, acceleration = flow(world, rest, *point)
     if world.waves:
@@ -223,8 +226,7 @@ def _angular_drag(parts: Parts, coefficient: Vec, flow: PartFlow, gather: Sum) -
         strength = tuple(map(gather, strength))
     drag = [quadratic_drag(x, c, 1.0) for x, c in zip(w, strength, strict=True)]
     torque = matvec(parts.rotation, tuple(t for t, _ in drag))
-    d = tuple(d for _, d in drag)
-    damping = rotate_sym(parts.rotation, (d[0], 0.0, 0.0, d[1], 0.0, d[2]))
+    damping = rotate_sym(parts.rotation, diagonal(tuple(d for _, d in drag)))
     if together:
         return torque, damping
     return tuple(map(gather, torque)), tuple(map(gather, damping))
@@ -235,13 +237,12 @@ def _damping(
 ) -> SpatialInertia | None:
     """Damping of forces along the parts' axes and of torques, about the bodies' origins."""
     if own is None:
-        return None if angular is None else SpatialInertia(angular, (_ZERO,) * 3, (0.0,) * 6)
+        return None if angular is None else SpatialInertia(angular, NO_MATRIX, (0.0,) * 6)
     if isinstance(own, SpatialInertia):
         about, along = (rotate_sym(parts.rotation, x) for x in (own.angular, own.linear))
         one = shift_inertia(along, about, parts.position, rotate(parts.rotation, own.cross))
     else:
-        x, y, z = own
-        along = rotate_sym(parts.rotation, (x, 0.0, 0.0, y, 0.0, z))
+        along = rotate_sym(parts.rotation, diagonal(own))
         one = shift_inertia(along, (0.0,) * 6, parts.position)
     turning = tuple(map(gather, one.angular))
     return SpatialInertia(
@@ -354,7 +355,7 @@ def _surface_tension(world: World, parts: Parts, at: _Immersion, wide: Sum) -> t
     """Force and torque of the surface's tension, part's axes, at the box's centre."""
     tension = world.surface_tension
     if tension is None or not find_buoyancy_law(parts.laws.buoyancy).lifts:
-        return _ZERO, _ZERO
+        return ZERO, ZERO
     return surface_tension(
         tuple(map(wide, at.up)),
         at.depth,
@@ -428,9 +429,9 @@ def _water_on_parts(
             blow = _near_surface_slam(parts, parts.carried, begun, close.share, before)
             force, torque = vadd(force, blow[0]), vadd(torque, blow[1])
         waves = close.damping
-        x, y, z = waves.angular[0], waves.angular[3], waves.angular[5]
         force = vsub(force, symvec(waves.linear, v))
-        torque = vsub(torque, tuple(c * t for c, t in zip((x, y, z), w, strict=True)))
+        about = waves.angular[0], waves.angular[3], waves.angular[5]
+        torque = vsub(torque, tuple(c * t for c, t in zip(about, w, strict=True)))
     elif before is not None and parts.carried is not None:
         rate = wetting_rate(submerged, before.submerged, before.dt)
         if not parts.laws.coupled:
@@ -460,9 +461,8 @@ def _water_on_parts(
     if close is not None and parts.carried is not None:
         own = parts.carried
         spins = turning_share(close.share, own.mass, parts.half_size)
-        x, y, z = (mul(m, s) for m, s in zip(own.mass, close.share, strict=True))
-        a, b, c = (mul(m, s) for m, s in zip(own.angular, spins, strict=True))
-        here = SpatialInertia((a, 0.0, 0.0, b, 0.0, c), (_ZERO,) * 3, (x, 0.0, 0.0, y, 0.0, z))
+        mass = tuple(map(mul, own.mass, close.share))
+        here = diagonal_inertia(tuple(map(mul, own.angular, spins)), mass)
         carried = _damping(parts, here, None, gather)
         found = _plus(
             _damping(parts, damping, angular, gather), _damping(parts, close.damping, None, gather)
@@ -517,10 +517,10 @@ def forces_on_parts(
         lift = matvec(parts.rotation, _surface_tension(world, parts, at, wide)[0])
         if find_buoyancy_law(parts.laws.buoyancy).lifts:
             lift = vadd(lift, _pressure(world, parts, at, gravity, wide)[1])
-        law, drag = find_drag_law(parts.laws.drag), _ZERO
+        law, drag = find_drag_law(parts.laws.drag), ZERO
         if isinstance(law, PartDragLaw):
             drag = matvec(parts.rotation, law.force(at.flow, parts.drag, world).force)
-        push: Vec = _ZERO
+        push: Vec = ZERO
         if parts.mounts is not None:
             push = _thrust(parts.mounts, at.flow.submerged, thrusts)[1]
         found.append(PartForces(*(tuple(map(wide, x)) for x in (lift, drag, push))))
@@ -596,7 +596,7 @@ def implicit_share(
     bound, w = level.bound, motion.angular_velocity
     if not is_present(bound.steep):
         return 0.0
-    stream = _stream(world, water, motion, _ZERO).velocity
+    stream = _stream(world, water, motion, ZERO).velocity
     v = motion.velocity if stream is None else vsub(motion.velocity, stream)
     # Σ s |v + ω × x|²
     turning = add(mul(2.0, dot(v, cross(w, bound.moment))), dot(w, symvec(bound.inertia, w)))
@@ -639,7 +639,7 @@ def water_forces(
     Returns:
         Forces, torques and inertias.
     """
-    torque, force = _ZERO, _ZERO
+    torque, force = ZERO, ZERO
     carried, damping, fractions = None, None, []
     submerged: list[Scalar] = []
     for parts, earlier in zip(level.parts, _by_group(level, before), strict=True):
@@ -657,16 +657,16 @@ def water_forces(
     if carried is None:
         return ExternalForces(torque, force, None, None, damping, tuple(submerged))
     angular, velocity = motion.midpoint_velocity
-    stream = _stream(world, water, motion, _ZERO)
+    stream = _stream(world, water, motion, ZERO)
     if stream.velocity is None:
         return ExternalForces(torque, force, carried, None, damping, tuple(submerged))
-    momentum = apply_inertia(carried, _ZERO, tuple(map(neg, stream.velocity)))
+    momentum = apply_inertia(carried, ZERO, tuple(map(neg, stream.velocity)))
     # The step turns the momentum with the body's velocity, not with the relative one.
     linear = apply_inertia(carried, angular, vsub(velocity, stream.velocity))[1]
     torque = vadd(torque, cross(stream.velocity, linear))
     change = cross(angular, stream.velocity)
     if stream.acceleration is not None:
         change = vsub(change, stream.acceleration)
-    turning = apply_inertia(carried, _ZERO, change)
+    turning = apply_inertia(carried, ZERO, change)
     torque, force = vsub(torque, turning[0]), vsub(force, turning[1])
     return ExternalForces(torque, force, carried, momentum, damping, tuple(submerged))

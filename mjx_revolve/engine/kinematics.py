@@ -16,6 +16,8 @@ from mjx_revolve.engine.state import State
 from mjx_revolve.engine.tree import Tree
 from mjx_revolve.numerics.inertia import BodyMotion
 from mjx_revolve.numerics.spatial import (
+    UNIT,
+    ZERO,
     Mat,
     Scalar,
     Vec,
@@ -151,8 +153,7 @@ def body_frames(
     Returns:
         Both poses.
     """
-    unit = tuple(tuple(float(i == j) for j in range(3)) for i in range(3))
-    root = (unit, (0.0, 0.0, 0.0))
+    root = (UNIT, ZERO)
 
     def move(_: Level, parents: Any, turn: Mat, place: Vec, step: Scalar) -> Any:
         s, c = sincos(step)
@@ -215,7 +216,7 @@ def center_of_mass(tree: Tree, state: State) -> Vec:
         )
         return (), (), (wide(level.mass), moment)
 
-    _, _, (mass, moment) = tree.backward_pass(weigh, ((), (0.0, (0.0, 0.0, 0.0))), below)
+    _, _, (mass, moment) = tree.backward_pass(weigh, ((), (0.0, ZERO)), below)
     own_mass, own = jax.tree.map(lambda x: x[0], weigh(tree.root, None, (root, None))[2])
     whole = add(own_mass, mass)
     return tuple(x + add(m, n) / whole for x, m, n in zip(core, own, moment, strict=True))

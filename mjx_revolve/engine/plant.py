@@ -20,6 +20,7 @@ from mjx_revolve.engine.assembly import Assembly
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.sites import ModuleSites, Sites
 from mjx_revolve.inputs.errors import InputError, show
+from mjx_revolve.numerics.spatial import cast
 
 # Centres of mass and of volume nearer than this are one point [m]: those of symmetric bodies are,
 # but for rounding. A choice.
@@ -263,8 +264,7 @@ class Plant:
     def _wide(self, x: Any, like: jax.Array) -> jax.Array:
         # NumPy's numbers take the genes' dtype: JAX keeps one typed copy of an array that it meets
         # in a trace, of whichever mode, 32 or 64 bits, it met it in first.
-        x = x if isinstance(x, jax.Array) else np.asarray(x, like.dtype)
-        return jnp.broadcast_to(x, (self.num_rows, *like.shape[1:])).astype(like.dtype)
+        return jnp.broadcast_to(cast(x, like), (self.num_rows, *like.shape[1:])).astype(like.dtype)
 
 
 def actuators_of(robot: Robot) -> np.ndarray:

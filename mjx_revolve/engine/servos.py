@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 
 from mjx_revolve.engine.level import Hinges
-from mjx_revolve.numerics.spatial import Scalar, add, mul, sub
+from mjx_revolve.numerics.spatial import Scalar, add, cast, mul, sub
 from mjx_revolve.water.drag import is_extrapolated
 from mjx_revolve.water.world import World
 
@@ -71,11 +69,11 @@ def servo(
     Returns:
         Torque [N·m] and inertia [kg·m²], `[nbody, lanes]`.
     """
-    target = jnp.clip(target, _cast(hinges.target[0], target), _cast(hinges.target[1], target))
+    target = jnp.clip(target, cast(hinges.target[0], target), cast(hinges.target[1], target))
     torque = sub(mul(hinges.gain, target), mul(hinges.stiffness, angle))
     damping = add(hinges.servo_damping, mul(damped * dt, hinges.implicit_stiffness))
     torque = sub(torque, mul(damping, speed))
-    low, high = (_cast(x, torque) for x in hinges.effort)
+    low, high = (cast(x, torque) for x in hinges.effort)
     # At its limit, torque does not depend on the angle, but the step may lead back below: the
     # secant of the limited spring. With none of it, light limbs swing from limit to limit for ever.
     square = jnp.asarray((1 + damped) ** 2 / 4 * dt * dt, torque.dtype)
@@ -83,7 +81,7 @@ def servo(
     share = jnp.minimum(limit / jnp.maximum(jnp.abs(torque), _TINY), 1)
     yielding = mul(square * share, hinges.implicit_stiffness)
     torque = jnp.clip(torque, low, high)
-    friction, gradient, top = (_cast(x, torque) for x in hinges.motor)
+    friction, gradient, top = (cast(x, torque) for x in hinges.motor)
     forward = jnp.sign(torque)
     rate, push = forward * speed, jnp.abs(torque)
 
@@ -91,7 +89,7 @@ def servo(
         return friction + gradient * (top - x)
 
     # The motor turns its base, too, the other way.
-    per_base = dt / _cast(hinges.base_inertia, torque)
+    per_base = dt / cast(hinges.base_inertia, torque)
     foreseen = (push + jnp.maximum(forward * load, 0)) / add(inertia, yielding)
     gain = dt * foreseen + per_base * push
     beyond = line(rate) < push
@@ -127,11 +125,7 @@ def motor_torque(
     """
     torque, _ = servo(hinges, angle, speed, target, dt, 1.0, 0.0, damped)
     # Beyond the top speed that torque brakes; a motor has no more than its effort.
-    return jnp.clip(torque, *(_cast(x, torque) for x in hinges.effort))
-
-
-def _cast(x: Scalar, like: jax.Array) -> Scalar:
-    return x if isinstance(x, jax.Array) else np.asarray(x, like.dtype)
+    return jnp.clip(torque, *(cast(x, torque) for x in hinges.effort))
 
 
 def end_stop(
@@ -155,12 +149,12 @@ def end_stop(
     Returns:
         Torque [N·m] and inertia [kg·m²], `[nbody, lanes]`.
     """
-    low, high = (_cast(x, angle) for x in hinges.range)
+    low, high = (cast(x, angle) for x in hinges.range)
     ahead = angle + dt * speed
     over = jnp.maximum(ahead - high, 0) - jnp.maximum(low - ahead, 0)
     soon = ahead + dt * gain
     at_end = (soon > high) | (soon < low)
-    stop = _cast(hinges.stop, angle)
+    stop = cast(hinges.stop, angle)
     # The damper never holds a hinge that swings back.
     outward = jnp.where(over * speed > 0, speed, 0)
     torque = jnp.where(at_end, -stop * (over + STOP_TIME * outward), 0)

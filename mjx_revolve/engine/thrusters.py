@@ -6,6 +6,7 @@ stand side by side, in one robot or in many.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -16,6 +17,7 @@ from mjx_revolve.body.module_types import Thruster
 from mjx_revolve.body.placement import counted
 from mjx_revolve.engine.assembly import Assembly
 from mjx_revolve.engine.level import Thrusters
+from mjx_revolve.numerics.spatial import cast
 from mjx_revolve.water.thrusters import (
     dead_band_thrust,
     ideal_power,
@@ -112,11 +114,8 @@ def run_thrusters(
         The lagged commands after the step, the thrusts, `[nthruster, lanes]` [N], and the power
         that ideal propellers need for them, `[nthruster, lanes]` [W] (`ideal_power`).
     """
-
-    def cast(x: Any) -> Any:
-        return x if isinstance(x, jax.Array) else np.asarray(x, ctrl.dtype)
-
-    clipped = jnp.clip(ctrl, cast(thrusters.low), cast(thrusters.high))
+    known = partial(cast, like=ctrl)
+    clipped = jnp.clip(ctrl, known(thrusters.low), known(thrusters.high))
     after = lagged_command(lagged, clipped, thrusters.kept)
     delayed = thrusters.delayed
     # Folded by XLA, the selection would leave `ctrl` unused in its piece of the step: it aborts.
@@ -124,11 +123,11 @@ def run_thrusters(
     acting = lagged if every else jnp.where(delayed, lagged, clipped)
     push = dead_band_thrust(
         acting,
-        *map(cast, (thrusters.backward, thrusters.forward)),
-        *map(cast, (thrusters.dead_low, thrusters.dead_high)),
+        *map(known, (thrusters.backward, thrusters.forward)),
+        *map(known, (thrusters.dead_low, thrusters.dead_high)),
     )
     if thrusters.line is not None:
         commands, thrusts, is_line = thrusters.line
-        line = interpolated_thrust(acting, list(map(cast, commands)), list(map(cast, thrusts)))
+        line = interpolated_thrust(acting, *(list(map(known, x)) for x in (commands, thrusts)))
         push = jnp.where(is_line, line, push)
-    return after, push, ideal_power(push, cast(thrusters.disc), density)
+    return after, push, ideal_power(push, known(thrusters.disc), density)

@@ -16,7 +16,7 @@ import numpy as np
 
 from mjx_revolve.engine.level import Hinges, Level, Thrusters
 from mjx_revolve.engine.step_constants import TORQUE_CURVE_KNEE
-from mjx_revolve.numerics.spatial import Scalar
+from mjx_revolve.numerics.spatial import Scalar, cast
 from mjx_revolve.water.laws import scale_numbers
 
 
@@ -63,7 +63,7 @@ def vary_thrusters(thrusters: Thrusters, variation: Variation) -> Thrusters:
     if not thrusters.count:
         return thrusters
     motor = jnp.atleast_1d(jnp.asarray(variation.motor))[None]
-    scale = lambda x: _as(x, motor) * motor  # noqa: E731
+    scale = lambda x: cast(x, motor) * motor  # noqa: E731
     line = thrusters.line
     if line is not None:
         commands, thrusts, is_line = line
@@ -78,8 +78,8 @@ def _vary_hinges(hinges: Hinges, motor: jax.Array) -> Hinges:
     limited = np.not_equal(gradient, 0) if not isinstance(gradient, jax.Array) else gradient != 0
     if not isinstance(limited, jax.Array) and not np.any(limited):
         return hinges
-    friction, gradient, top = (_as(x, motor) for x in (friction, gradient, top))
-    effort = _as(hinges.effort[1], motor)
+    friction, gradient, top = (cast(x, motor) for x in (friction, gradient, top))
+    effort = cast(hinges.effort[1], motor)
     steeper = jnp.maximum((effort - motor * friction) / ((1 - TORQUE_CURVE_KNEE) * motor * top), 0)
     # Where there is no limit, the line lies far above any torque, and stays there.
     return hinges._replace(
@@ -89,7 +89,3 @@ def _vary_hinges(hinges: Hinges, motor: jax.Array) -> Hinges:
             jnp.where(limited, motor * top, top),
         )
     )
-
-
-def _as(x: Scalar, like: jax.Array) -> Scalar:
-    return x if isinstance(x, jax.Array) else np.asarray(x, like.dtype)

@@ -19,6 +19,7 @@ from mjx_revolve.numerics.spatial import (
     add,
     cross,
     full,
+    madd,
     matmul,
     matvec,
     mul,
@@ -47,8 +48,10 @@ def to_parent(
         angular, linear, back = (rotate(turn, x) for x in (block.angular, block.linear, block.back))
     torque, force = (matvec(turn, x) for x in bias)
     r = skew(position)
-    shifted = plus(across, matmul(r, linear))
-    below = transpose(shifted) if symmetric else _minus(back, matmul(linear, r))
+    shifted = madd(across, matmul(r, linear))
+    below = transpose(shifted)
+    if not symmetric:
+        below = tuple(map(vsub, back, matmul(linear, r)))
     first, second = matmul(r, back), matmul(shifted, r)
     entry = lambda i, j: sub(add(angular[i][j], first[i][j]), second[i][j])  # noqa: E731
     moved = _square(entry, symmetric)
@@ -65,15 +68,6 @@ def _square(entry: Callable[[int, int], Scalar], symmetric: bool) -> Mat:
     if symmetric:
         return full(tuple(entry(i, j) for i, j in SYM))
     return tuple(tuple(entry(i, j) for j in range(3)) for i in range(3))
-
-
-def plus(a: Mat, b: Mat) -> Mat:
-    """A + B."""
-    return tuple(vadd(x, y) for x, y in zip(a, b, strict=True))
-
-
-def _minus(a: Mat, b: Mat) -> Mat:
-    return tuple(vsub(x, y) for x, y in zip(a, b, strict=True))
 
 
 class JointElimination(NamedTuple):

@@ -6,27 +6,31 @@ Spatial quantities are (angular, linear), in each body's own frame, about its ow
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 from mjx_revolve.numerics.spatial import (
+    NO_MATRIX,
     SYM,
     Mat,
     Scalar,
     Sym,
     Vec,
-    add,
     cross,
+    diagonal,
     full,
+    madd,
     matmul,
     matvec,
+    mscale,
     mul,
-    neg,
     skew,
     sub,
     symvec,
     total,
     transpose,
     vadd,
+    vscale,
 )
 
 
@@ -97,22 +101,14 @@ def gyroscope(angular: Vec, linear: Vec) -> Block:
 
     It is antisymmetric: for any h that force does no work.
     """
-    turned = tuple(tuple(neg(x) for x in row) for row in skew(linear))
-    zero = ((0.0, 0.0, 0.0),) * 3
-    return Block(tuple(tuple(neg(x) for x in row) for row in skew(angular)), turned, turned, zero)
+    turned = mscale(-1.0, skew(linear))
+    return Block(mscale(-1.0, skew(angular)), turned, turned, NO_MATRIX)
 
 
 def add_block(a: Block, s: Scalar, b: Block) -> Block:
     """A + s b."""
-    return Block(
-        *(
-            tuple(
-                tuple(add(x, mul(s, y)) for x, y in zip(p, q, strict=True))
-                for p, q in zip(m, n, strict=True)
-            )
-            for m, n in zip(a, b, strict=True)
-        )
-    )
+    scaled = ((map(partial(mul, s), row) for row in matrix) for matrix in b)
+    return Block(*map(madd, a, scaled))
 
 
 def apply_block(a: Block, angular_velocity: Vec, velocity: Vec) -> tuple[Vec, Vec]:
@@ -132,22 +128,21 @@ def apply_inertia(inertia: SpatialInertia, angular_velocity: Vec, velocity: Vec)
     return angular, linear
 
 
+def diagonal_inertia(angular: Vec, linear: Vec) -> SpatialInertia:
+    """The inertia with these on its diagonal."""
+    return SpatialInertia(diagonal(angular), NO_MATRIX, diagonal(linear))
+
+
 def add_inertia(a: SpatialInertia, b: SpatialInertia) -> SpatialInertia:
     """The sum of two spatial inertias."""
     return SpatialInertia(
-        vadd(a.angular, b.angular),
-        tuple(vadd(x, y) for x, y in zip(a.cross, b.cross, strict=True)),
-        vadd(a.linear, b.linear),
+        vadd(a.angular, b.angular), madd(a.cross, b.cross), vadd(a.linear, b.linear)
     )
 
 
 def scale_inertia(s: Scalar, a: SpatialInertia) -> SpatialInertia:
     """A spatial inertia times a scalar."""
-    return SpatialInertia(
-        tuple(mul(s, x) for x in a.angular),
-        tuple(tuple(mul(s, x) for x in row) for row in a.cross),
-        tuple(mul(s, x) for x in a.linear),
-    )
+    return SpatialInertia(vscale(s, a.angular), mscale(s, a.cross), vscale(s, a.linear))
 
 
 def shift_inertia(
@@ -169,10 +164,8 @@ def shift_inertia(
     second = matmul(across, x)
     if cross is not None:
         once = matmul(cross, x)
-        second = tuple(
-            vadd(row, vadd(a, b)) for row, a, b in zip(second, once, transpose(once), strict=True)
-        )
-        across = tuple(vadd(a, b) for a, b in zip(cross, across, strict=True))
+        second = madd(second, map(vadd, once, transpose(once)))
+        across = madd(cross, across)
     return SpatialInertia(
         tuple(sub(angular[k], second[i][j]) for k, (i, j) in enumerate(SYM)), across, linear
     )

@@ -22,6 +22,9 @@ Vec = tuple[Scalar, ...]  # 3
 Mat = tuple[Vec, ...]  # 3 rows
 Sym = tuple[Scalar, ...]  # 6: xx, xy, xz, yy, yz, zz
 
+ZERO: Vec = (0.0, 0.0, 0.0)
+NO_MATRIX: Mat = (ZERO, ZERO, ZERO)
+UNIT: Mat = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 SYM = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _SYM_INDEX = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 
@@ -45,6 +48,11 @@ def fold(a: np.ndarray) -> float | np.ndarray:
 def _as(a: Scalar, like: jax.Array) -> Scalar:
     """A constant in the dtype of the other operand: NumPy's float64 must not widen float32."""
     return np.asarray(a, like.dtype) if isinstance(a, np.ndarray | np.generic) else a
+
+
+def cast(a: Scalar, like: Scalar) -> Scalar:
+    """A constant, plain numbers too, in the dtype of what it meets; a traced number as it is."""
+    return a if isinstance(a, jax.Array) else np.asarray(a, like.dtype)
 
 
 def is_present(x: Scalar) -> bool:
@@ -91,11 +99,7 @@ def neg(a: Scalar) -> Scalar:
 
 def sub(a: Scalar, b: Scalar) -> Scalar:
     """Difference; folds constant 0."""
-    if _constant(b):
-        return add(a, -b)
-    if _constant(a):
-        return add(a, -b)
-    return a - b
+    return add(a, -b) if _constant(a) or _constant(b) else a - b
 
 
 def total(*terms: Scalar) -> Scalar:
@@ -135,6 +139,16 @@ def vscale(s: Scalar, a: Iterable[Scalar]) -> Vec:
     return tuple(mul(s, x) for x in a)
 
 
+def madd(a: Iterable[Iterable[Scalar]], b: Iterable[Iterable[Scalar]]) -> Mat:
+    """A + b of two matrices."""
+    return tuple(vadd(x, y) for x, y in zip(a, b, strict=True))
+
+
+def mscale(s: Scalar, a: Iterable[Vec]) -> Mat:
+    """S a of a matrix."""
+    return tuple(vscale(s, row) for row in a)
+
+
 def matvec(r: Mat, x: Vec) -> Vec:
     """R x: from the child's frame to the parent's."""
     return tuple(dot(row, x) for row in r)
@@ -159,6 +173,11 @@ def matmul(a: Mat, b: Mat) -> Mat:
 def full(s: Sym) -> Mat:
     """The nine entries of a symmetric matrix."""
     return tuple(tuple(s[k] for k in row) for row in _SYM_INDEX)
+
+
+def diagonal(x: Vec) -> Sym:
+    """The symmetric matrix with these three on its diagonal."""
+    return x[0], 0.0, 0.0, x[1], 0.0, x[2]
 
 
 def symvec(s: Sym, x: Vec) -> Vec:

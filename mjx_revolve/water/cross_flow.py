@@ -33,9 +33,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mjx_revolve.numerics.inertia import SpatialInertia
+from mjx_revolve.numerics.inertia import diagonal_inertia
 from mjx_revolve.numerics.lazy import jnp
 from mjx_revolve.numerics.spatial import (
+    ZERO,
     Scalar,
     add,
     cross,
@@ -65,7 +66,6 @@ from mjx_revolve.water.laws import (
 if TYPE_CHECKING:
     from mjx_revolve.water.world import World
 
-_ZERO = (0.0, 0.0, 0.0)
 # Gauss's two points on -1 to 1, ± this, each with half of the drag.
 _PLACE = 3**-0.5
 _VARIED = ("drag", "density")
@@ -210,7 +210,7 @@ def _force(flow: PartFlow, numbers: CrossFlowNumbers, world: World) -> Drag:
     ahead = dot(flow.velocity, along)
     across = vsub(flow.velocity, vscale(ahead, along))
     spin = cross(flow.angular_velocity, along)
-    damping, pushes = (0.0, 0.0, 0.0), []
+    damping, pushes = ZERO, []
     for place in (0.5, -0.5):
         at = vadd(across, vscale(mul(2 * place, numbers.reach), spin))
         speed = jnp.sqrt(add(_STILL, dot(at, at)))
@@ -245,20 +245,17 @@ def _force(flow: PartFlow, numbers: CrossFlowNumbers, world: World) -> Drag:
         second = vadd(second, vscale(mul(numbers.end, numbers.end), lost))
     axes = tuple(mul(a, a) for a in along)
     force = vadd(force, vscale(thrust, along))
-    x, y, z = vadd(damping, vscale(rubbed, axes))
+    damping = vadd(damping, vscale(rubbed, axes))
     # First moments are left out: the damping is still at least half of what it stands for.
-    a, b, c = (
+    turning = tuple(
         add(mul(second[j], axes[k]), mul(second[k], axes[j])) for j, k in ((1, 2), (2, 0), (0, 1))
     )
-    own = SpatialInertia((a, 0.0, 0.0, b, 0.0, c), (_ZERO,) * 3, (x, 0.0, 0.0, y, 0.0, z))
-    return Drag(force, cross(along, lever), own)
+    return Drag(force, cross(along, lever), diagonal_inertia(turning, damping))
 
 
 CROSS_FLOW = PartDragLaw(
     name="cross_flow",
     summary="drag across chains and rods, friction, wakes of chains' ends; elsewhere of faces",
-    explicit=False,
-    varied=True,
     steepest=3.0,  # C_d of 1.75 across
     by_faces=True,
     coefficients=(

@@ -17,8 +17,6 @@ from mjx_revolve.water.plate_wake import PLATE_WAKE
 OFF = PartDragLaw(
     name="off",
     summary="no drag",
-    explicit=False,
-    varied=True,
     steepest=0.0,
     mjcf=Export("", missing="modules without drag next to others with it"),
     sdf=Export(""),

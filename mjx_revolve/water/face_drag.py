@@ -123,8 +123,6 @@ def _face_drag(flow: PartFlow, numbers: FaceNumbers, world: World) -> Drag:
 FACES = PartDragLaw(
     name="faces",
     summary="quadratic drag on the true faces of the parts, and against their turning",
-    explicit=False,
-    varied=True,
     steepest=3.0,  # C_d of 1.05
     by_faces=True,
     coefficients=(

@@ -32,6 +32,7 @@ from mjx_revolve.numerics.spatial import (
     Scalar,
     Vec,
     add,
+    cast,
     cross,
     dot,
     is_present,
@@ -138,8 +139,7 @@ def _incidence(flow: PartFlow, fin: FinWakeNumbers) -> tuple[Scalar, Scalar]:
 
 def _cast(fin: FinWakeNumbers, like: Any) -> FinWakeNumbers:
     """Constants in the dtype of what they meet."""
-    cast = lambda x: x if isinstance(x, jax.Array) else np.asarray(x, like.dtype)  # noqa: E731
-    found: FinWakeNumbers = jax.tree.map(cast, fin)
+    found: FinWakeNumbers = jax.tree.map(lambda x: cast(x, like), fin)
     return found
 
 
@@ -188,8 +188,6 @@ def _remember(flow: PartFlow, fin: FinWakeNumbers, world: World, dt: float) -> t
 FIN_WAKE = PartDragLaw(
     name="fin_wake",
     summary="lift_drag with a lag of the lift, and drag that follows from it",
-    explicit=False,
-    varied=True,
     steepest=lambda fin: fin.gradient * fin.area,
     coefficients=(
         Coefficient(

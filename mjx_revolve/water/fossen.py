@@ -84,8 +84,6 @@ def _force(flow: PartFlow, numbers: FossenNumbers, world: World) -> Drag:
 FOSSEN = PartDragLaw(
     name="fossen",
     summary="linear and quadratic damping that a module states itself; none where none is stated",
-    explicit=False,
-    varied=True,
     parameters=Fossen,
     numbers=_numbers,
     force=_force,

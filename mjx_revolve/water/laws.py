@@ -17,14 +17,15 @@ import math
 import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar, dataclass_transform
 
 import numpy as np
+from jaxtyping import Float
 
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.inertia import SpatialInertia
 from mjx_revolve.numerics.lazy import jax
-from mjx_revolve.numerics.spatial import Scalar, Vec, mul
+from mjx_revolve.numerics.spatial import ZERO, Scalar, Vec, mul
 
 if TYPE_CHECKING:
     from mjx_revolve.water.world import World
@@ -202,44 +203,33 @@ class Export(NamedTuple):
     missing: str = ""
 
 
-class PartShapes(Protocol):
-    """What laws take their numbers from: n parts, each in its own frame; NumPy."""
+@dataclass(frozen=True, eq=False)
+class PartShapes:
+    """What laws take their numbers from: n parts, each in its own frame; NumPy.
 
-    @property
-    def half_size(self) -> np.ndarray:
-        """`[n, 3]` half edges of the boxes [m]."""
+    Attributes:
+        half_size: half edges of the boxes [m].
+        silhouette: area of the part's boxes together, seen along each axis [m²].
+        exposed: share of each pair of faces that the water reaches [-].
+        joined: share that neighbours cover of the ends by which the part is in a row of parts [-];
+            1 of a part that is a row by itself.
+        ends: 1 or -1 along each axis where a row of parts ends with the part, in that direction;
+            else 0.
+        rows: length of that row [m].
+        coefficients: `[n]` each, or `[n, 3]` per axis: every `Coefficient` of the laws, by name.
+        parameters: `[n]` each: the parameters of laws that have a class of them, by the law's name.
+        factors: `[n]` each: the parts' own factors, by the names that `PartField.varied` has.
+    """
 
-    @property
-    def silhouette(self) -> np.ndarray:
-        """`[n, 3]` area seen along each axis [m²]."""
-
-    @property
-    def exposed(self) -> np.ndarray:
-        """`[n, 3]` share of each pair of faces that the water reaches [-]."""
-
-    @property
-    def joined(self) -> np.ndarray:
-        """`[n, 3]` share of its ends in a row that neighbours cover [-]; 1 of a row by itself."""
-
-    @property
-    def ends(self) -> np.ndarray:
-        """`[n, 3]` 1 or -1 along each axis where a row of parts ends with the part; else 0."""
-
-    @property
-    def rows(self) -> np.ndarray:
-        """`[n, 3]` length of that row [m]."""
-
-    @property
-    def coefficients(self) -> Mapping[str, np.ndarray]:
-        """`[n]` each, or `[n, 3]` per axis: every `Coefficient` of the laws, by name."""
-
-    @property
-    def parameters(self) -> Mapping[str, tuple[Any, ...]]:
-        """`[n]` each: the parameters of laws that have a class of them, by the law's name."""
-
-    @property
-    def factors(self) -> Mapping[str, np.ndarray]:
-        """`[n]` each: the parts' own factors, by the names that `PartField.varied` has."""
+    half_size: Float[np.ndarray, "n 3"]
+    silhouette: Float[np.ndarray, "n 3"]
+    exposed: Float[np.ndarray, "n 3"]
+    joined: Float[np.ndarray, "n 3"]
+    ends: Float[np.ndarray, "n 3"]
+    rows: Float[np.ndarray, "n 3"]
+    coefficients: Mapping[str, Float[np.ndarray, "n ..."]]
+    parameters: Mapping[str, tuple[Any, ...]]
+    factors: Mapping[str, Float[np.ndarray, " n"]]
 
 
 class PartFlow(NamedTuple):
@@ -274,8 +264,7 @@ class Drag(NamedTuple):
     damping: Vec | SpatialInertia | None
 
 
-_ZERO: Vec = (0.0, 0.0, 0.0)
-NO_DRAG = Drag(_ZERO, _ZERO, None)
+NO_DRAG = Drag(ZERO, ZERO, None)
 
 
 @dataclass(frozen=True)
@@ -304,8 +293,8 @@ class DragLaw:
     summary: str
     mjcf: Export
     sdf: Export
-    explicit: bool
-    varied: bool
+    explicit: bool = False
+    varied: bool = True
     steepest: float | Callable[[Any], np.ndarray] | None = None
     by_faces: bool = False
     coefficients: tuple[Coefficient, ...] = ()
@@ -356,7 +345,7 @@ class BodyDragLaw(DragLaw):
             torque [N·m], inertial frame, at the centre of mass.
     """
 
-    body_force: Callable[[Vec, Vec, Vec, float, float], tuple[Vec, Vec]] = lambda *_: (_ZERO, _ZERO)
+    body_force: Callable[[Vec, Vec, Vec, float, float], tuple[Vec, Vec]] = lambda *_: (ZERO, ZERO)
 
 
 @dataclass(frozen=True)

@@ -286,8 +286,6 @@ def _plate_drag(flow: PartFlow, plate: PlateNumbers, world: World) -> Drag:
 LIFT_DRAG = PartDragLaw(
     name="lift_drag",
     summary="Gazebo's lift and drag of a plate",
-    explicit=False,
-    varied=True,
     # 10: lift of 2π, and drag.
     steepest=lambda plate: np.maximum(10.0, _gradient(plate, float)) * plate.area,
     parameters=LiftDrag,

@@ -33,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.numerics.inertia import SpatialInertia
-from mjx_revolve.numerics.spatial import SYM, Scalar, Vec, mul, total
+from mjx_revolve.numerics.spatial import NO_MATRIX, SYM, Scalar, Vec, diagonal, mul, total
 from mjx_revolve.water.added_mass import CarriedWater
 from mjx_revolve.water.coefficients import TODAY
 
@@ -122,6 +122,5 @@ def near_surface(
                 long = mul(size[k] * size[k], 1 / 12)
                 lever = lever + square[i] * jnp.where(size[k] > size[j], long, roll)
         about.append(strength * lever)
-    x, y, z = about
     linear = tuple(strength * up[i] * up[j] for i, j in SYM)
-    return NearSurface(share, SpatialInertia((x, 0.0, 0.0, y, 0.0, z), ((0.0,) * 3,) * 3, linear))
+    return NearSurface(share, SpatialInertia(diagonal(tuple(about)), NO_MATRIX, linear))

@@ -136,8 +136,6 @@ def _remember(
 PLATE_WAKE = PartDragLaw(
     name="plate_wake",
     summary="cross_flow, and of thin plates a drag that remembers their wake",
-    explicit=False,
-    varied=True,
     steepest=10.0,  # C_d of up to 10 where a plate swings a little
     numbers=_numbers,
     force=_force,
