@@ -8,9 +8,11 @@ are constants: products with them fold away while the step is traced.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import jax
@@ -188,18 +190,23 @@ class RowOrder(NamedTuple):
     piece: np.ndarray
     rank: np.ndarray
 
+    @property
+    def body_rows(self) -> np.ndarray:
+        """`[nbody]` which of its robot's rows each body's first one is; of roots anything."""
+        return self.place[np.clip(self.first, 0, None)] if len(self.place) else self.first
 
-def order_rows(assembly: Assembly, columns: StepConstants, groups: Sequence[PartGroup]) -> RowOrder:
+
+def order_rows(columns: StepConstants, groups: Sequence[PartGroup]) -> RowOrder:
     """The rows of robots.
 
     Args:
-        assembly: of the robots.
         columns: of the robots.
         groups: how many parts of each kind a row and the root hold.
 
     Returns:
         The rows.
     """
+    assembly = columns.assembly
     nbody, parent = len(assembly.parent), assembly.parent.tolist()
     # How many parts before each one are on its body and obey its laws.
     rank = _ranks(columns.part_body * len(columns.laws) + columns.part_laws)
@@ -296,30 +303,28 @@ def fit_capacity(
     Raises:
         InputError: there are no robots.
     """
-    assembly = assemble_all(robots)
-    meeting = _list_pairs(robots)
-    columns, world = read_constants(assembly, meeting), robots[0].world
+    columns, world = _read_all(robots), robots[0].world
     carries = columns.parts.carried is not None
-    sizes = _sizes(assembly, columns)
+    sizes = _sizes(columns)
     if modules and drags_whole_bodies(world.drag):  # no part may overflow
-        sizes = _widest_bodies(assembly, columns, sizes, modules)
+        sizes = _widest_bodies(columns, sizes, modules)
     # Of one name there may be several, with params of their own.
     types = {id(k): k for k in (*(m.kind for r in robots for m in r.morphology.modules), *kinds)}
     # Nothing acts on what neither floats nor drags nor carries nor pushes.
     every = [x for x in columns.laws if not x.idle or carries or world.self_contact]
     near = contact and world.bed is not None
-    groups, order = _choose_groups(assembly, columns, sizes, every, bool(modules))
+    groups, order = _choose_groups(columns, sizes, every, bool(modules))
     count = max(1, rows, hinges, int(order.length.max()))
     slots = 1 + int(order.slot.max(initial=0))
     thrusters = int(sizes.thrusters.max())
-    points, root_points = _count_points(assembly, order) if near else (0, 0)
-    shells, root_shells = _count_shells(assembly, order, meeting)
+    points, root_points = _find_points(columns, order).most if near else (0, 0)
+    shells, root_shells = _find_shells(columns, order).most
     more = bool(modules or hinges or rows or kinds) and world.self_contact
     if more:
         shells = sum(group.parts for group in groups)
         root_shells = sum(group.root_parts for group in groups)
     if modules:
-        count = max(count, _most_rows(assembly, columns, groups, modules, hinges))
+        count = max(count, _most_rows(columns, groups, modules, hinges))
         thrusters = (modules - 1) * any(kind.is_thruster for kind in types.values())
         points = 8 * sum(group.parts for group in groups) if near else 0
         root_points = 8 * sum(group.root_parts for group in groups) if near else 0
@@ -329,13 +334,12 @@ def fit_capacity(
     largest, pairs = int(sizes.hinges.max()), int(sizes.pairs.max())
     if hinges > largest or modules:
         pairs = hinges * (hinges - 1) // 2  # any two may share the core
+    most_shells = root_shells + count * shells
+    meetings = [robot.assembly.meeting_pairs for robot in robots]
     capacity = Capacity(
         hinges=max(largest, hinges),
         thrusters=thrusters,
-        curve_points=max(
-            (curve_points(part.thruster) for kind in types.values() for part in kind.parts),
-            default=0,
-        ),
+        curve_points=max(curve_points(x.thruster) for k in types.values() for x in k.parts),
         pairs=pairs,
         rows=count,
         slots=slots,
@@ -344,27 +348,19 @@ def fit_capacity(
         root_points=root_points,
         shells=shells,
         root_shells=root_shells,
-        meetings=_most_meetings(robots, root_shells + count * shells, more),
+        meetings=most_shells * (most_shells - 1) // 2 if more else max(map(len, meetings)),
         carries=carries,
         timestep=world.timestep,
         nothing=jax.tree.map(lambda x: x[-1:], columns.parts),
         sites=tuple(sites),
     )
-    one = _pick_rows(assembly, columns, capacity, order, meeting)[:2]
+    root, row, *_ = _pick_rows(columns, capacity, order)
     known = list(types.values())
-    return replace(
-        capacity,
-        root=_constants(one[0], known, False, world),
-        row=_constants(one[1], known, True, world),
-    )
+    return replace(capacity, root=_constants(root, known, world), row=_constants(row, known, world))
 
 
 def _choose_groups(
-    assembly: Assembly,
-    columns: StepConstants,
-    sizes: _Sizes,
-    every: Sequence[PartLaws],
-    spilling: bool,
+    columns: StepConstants, sizes: _Sizes, every: Sequence[PartLaws], spilling: bool
 ) -> tuple[tuple[PartGroup, ...], RowOrder]:
     """Room for parts with which a step of these robots costs least, and their rows.
 
@@ -373,38 +369,34 @@ def _choose_groups(
     most = {laws: int(sizes.parts[laws].max()) for laws in every}
     most_root = {laws: int(sizes.root_parts[laws].max()) for laws in every}
     # Drag and submerged share are of a body as a whole: no part may overflow into another row.
-    whole = drags_whole_bodies(assembly.world.drag)
+    whole = drags_whole_bodies(columns.assembly.world.drag)
     least = max(1, *most.values()) if whole and most else 1
     widest = max(1, *most_root.values()) if most_root else 1
     on_root = [widest]
     if spilling and not whole:
         on_root = [n for n in _ROOT_PARTS if n < widest] + on_root
-    best: tuple[float, tuple[PartGroup, ...], RowOrder] | None = None
-    for limit in range(least, max(9, least + 1)):
-        for root_limit in on_root:
-            groups = tuple(
-                PartGroup(
-                    laws, min(limit, most[laws]) or 1, max(1, min(root_limit, most_root[laws]))
-                )
-                for laws in every
-            )
-            order = order_rows(assembly, columns, groups)
-            # A chunk of robots is as slow as its largest; one robot alone as it is itself.
-            count = (
-                (order.length.max() + order.length.mean()) / 2 if spilling else order.length.max()
-            )
-            cost = max(1, count) * (_ROW_COST + sum(group.parts for group in groups))
-            cost += sum(group.root_parts for group in groups) * spilling
-            if best is None or cost < best[0]:
-                best = (cost, groups, order)
-    assert best is not None
-    return best[1], best[2]
+
+    def room(limits: tuple[int, int]) -> tuple[float, tuple[PartGroup, ...], RowOrder]:
+        """What a step costs with at most so many parts of each kind in a row and on the root."""
+        limit, root_limit = limits
+        groups = tuple(
+            PartGroup(laws, min(limit, most[laws]) or 1, max(1, min(root_limit, most_root[laws])))
+            for laws in every
+        )
+        order = order_rows(columns, groups)
+        # A chunk of robots is as slow as its largest; one robot alone as it is itself.
+        count = (order.length.max() + order.length.mean()) / 2 if spilling else order.length.max()
+        cost = max(1, count) * (_ROW_COST + sum(group.parts for group in groups))
+        return cost + sum(group.root_parts for group in groups) * spilling, groups, order
+
+    tried = map(room, itertools.product(range(least, max(9, least + 1)), on_root))
+    _, groups, order = min(tried, key=itemgetter(0))
+    return groups, order
 
 
-def _widest_bodies(
-    assembly: Assembly, columns: StepConstants, sizes: _Sizes, modules: int
-) -> _Sizes:
+def _widest_bodies(columns: StepConstants, sizes: _Sizes, modules: int) -> _Sizes:
     """Sizes with room for the most parts on one body of the robots' types of modules."""
+    assembly = columns.assembly
     module, nbody = assembly.layout.module, len(assembly.parent)
     is_core = np.array([m.parent < 0 for body in assembly.morphologies for m in body.modules])
     parts, root_parts = {}, {}
@@ -419,27 +411,20 @@ def _widest_bodies(
 
 
 def _most_rows(
-    assembly: Assembly,
-    columns: StepConstants,
-    groups: Sequence[PartGroup],
-    modules: int,
-    hinges: int,
+    columns: StepConstants, groups: Sequence[PartGroup], modules: int, hinges: int
 ) -> int:
     """The most rows of bodies of the robots' types of modules, with at most so many of them."""
+    assembly = columns.assembly
     all_modules = [module for body in assembly.morphologies for module in body.modules]
-    core, turns, rigid = (
-        [m.parent < 0 for m in all_modules],
-        [m.kind.hinge is not None for m in all_modules],
-        [m.parent >= 0 and m.kind.hinge is None for m in all_modules],
-    )
+    core = np.array([m.parent < 0 for m in all_modules])
+    turns = np.array([m.kind.hinge is not None for m in all_modules])
     found = 0
     for count in range(min(hinges, modules - 1) + 1):
         rows = count
         for group in groups:
             held = columns.part_laws == columns.laws.index(group.laws)
             parts = np.bincount(assembly.layout.module[held], minlength=len(all_modules))
-            most = [max((int(parts[k]) for k in np.flatnonzero(x)), default=0)
-                    for x in (core, turns, rigid)]  # fmt: skip
+            most = [int(parts[x].max(initial=0)) for x in (core, turns, ~(core | turns))]
             total = most[0] + count * most[1] + (modules - 1 - count) * most[2]
             # Each hinge's body has a part in no overflow row; so has the root, or it is full.
             spare = total - count * (most[1] > 1)
@@ -448,50 +433,51 @@ def _most_rows(
     return found
 
 
-def _count_points(assembly: Assembly, order: RowOrder) -> tuple[int, int]:
-    """The most contact points of a row, and of a root."""
-    part = assembly.point_part
-    body = assembly.fluid.body[part]
-    most, at_root = 0, 0
-    if len(part):
-        first = (order.piece[part] == 0) & (assembly.parent[body] == 0)
-        place = body * (1 + int(order.piece.max())) + order.piece[part]
-        at_root = int(np.bincount(place[first], minlength=1).max())
-        most = int(np.bincount(place[~first], minlength=1).max())
-    return most, at_root
+class _Places(NamedTuple):
+    """Where points or shells of robots stand.
+
+    Attributes:
+        body: `[n]` that each is on.
+        piece: `[n]` which of the body's pieces.
+        rank: `[n]` which of the things there.
+        most: how many stand in a row, and on a root, at most.
+    """
+
+    body: np.ndarray
+    piece: np.ndarray
+    rank: np.ndarray
+    most: tuple[int, int]
 
 
-def _most_meetings(robots: Sequence[Robot], shells: int, more: bool) -> int:
-    """Room for pairs of boxes: as many as any of these robots has, or as any other may have."""
-    if more:
-        return shells * (shells - 1) // 2
-    return max(len(robot.assembly.meeting_pairs) for robot in robots)
+def _find_places(columns: StepConstants, order: RowOrder, part: np.ndarray) -> _Places:
+    """Where things stand that belong to such parts, `[n]`."""
+    body, piece = columns.part_body[part], order.piece[part]
+    rank = _ranks(body * (1 + int(order.piece.max(initial=0))) + piece)
+    at_root = (columns.assembly.parent[body] == 0) & (piece == 0)
+    in_row, on_root = (int(rank[x].max(initial=-1)) + 1 for x in (~at_root, at_root))
+    return _Places(body, piece, rank, (in_row, on_root))
 
 
-def _list_pairs(robots: Sequence[Robot]) -> np.ndarray:
-    """`[pairs, 2]` parts of the robots that can meet, rows of all their tables together."""
+def _find_points(columns: StepConstants, order: RowOrder) -> _Places:
+    """Where contact points stand."""
+    return _find_places(columns, order, columns.assembly.point_part)
+
+
+def _find_shells(columns: StepConstants, order: RowOrder) -> _Places:
+    """Where parts stand that can meet others, in the order of the fluid table."""
+    return _find_places(columns, order, np.unique(columns.pairs))
+
+
+def _read_all(robots: Sequence[Robot]) -> StepConstants:
+    """The columns of robots of one world, one behind the other."""
+    assembly = assemble_all(robots)
     counts = [len(robot.fluid.volume) for robot in robots]
     starts = np.cumsum([0, *counts])
     pairs = [robot.assembly.meeting_pairs + k for robot, k in zip(robots, starts, strict=False)]
-    return np.concatenate(pairs).astype(int)
+    return read_constants(assembly, np.concatenate(pairs).astype(int))
 
 
-def _shell_places(order: RowOrder, assembly: Assembly, pairs: np.ndarray) -> Any:
-    """Parts that can meet others: `[n]` which, their bodies, pieces and ranks in their pieces."""
-    part = np.unique(pairs)
-    held, piece = assembly.fluid.body[part], order.piece[part]
-    return part, held, piece, _ranks(held * (1 + int(order.piece.max(initial=0))) + piece)
-
-
-def _count_shells(assembly: Assembly, order: RowOrder, pairs: np.ndarray) -> tuple[int, int]:
-    """The most boxes that can meet others of a row, and of a root."""
-    _, held, piece, rank = _shell_places(order, assembly, pairs)
-    at_root = (assembly.parent[held] == 0) & (piece == 0)
-    most = [int(rank[x].max(initial=-1)) + 1 for x in (~at_root, at_root)]
-    return most[0], most[1]
-
-
-def _constants(level: Level, kinds: Sequence[ModuleType], hinges: bool, world: World) -> Level:
+def _constants(level: Level, kinds: Sequence[ModuleType], world: World) -> Level:
     """What is the same in all bodies of some types: those numbers, and None in all other places."""
     blank: Level = jax.tree.map(lambda _: None, level)
     if _is_square(kinds):
@@ -513,7 +499,7 @@ def _constants(level: Level, kinds: Sequence[ModuleType], hinges: bool, world: W
     found = {_hinge_numbers(kind) for kind in kinds if kind.hinge is not None}
     if blank.hinges is not None and not ends:
         blank = replace(blank, hinges=blank.hinges._replace(lever=0.0))
-    if hinges and blank.hinges is not None and len(found) == 1:
+    if blank.hinges is not None and len(found) == 1:
         effort, reach, damping, motor = found.pop()
         same = blank.hinges._replace(
             damping=damping,
@@ -559,16 +545,13 @@ def _is_square(kinds: Sequence[ModuleType]) -> bool:
 
 
 def _pick_rows(
-    assembly: Assembly,
-    columns: StepConstants,
-    capacity: Capacity,
-    order: RowOrder,
-    pairs: np.ndarray,
+    columns: StepConstants, capacity: Capacity, order: RowOrder
 ) -> tuple[Level, Level, np.ndarray, np.ndarray]:
     """Roots `[1, R]` and rows `[rows, 1, R]` of R robots; `[2, meetings, R]` pairs of shells.
 
     And `[meetings, R]` by how much these overlap at rest [m].
     """
+    assembly, pairs = columns.assembly, columns.pairs
     count, rows = len(assembly.roots), capacity.rows
     whole = np.zeros((rows, count), int)
     whole[order.place, order.robot] = order.body
@@ -576,12 +559,14 @@ def _pick_rows(
     body[order.place[order.overflow], order.robot[order.overflow]] = 0
 
     def place(
-        which: np.ndarray, held: np.ndarray, piece: np.ndarray, rank: np.ndarray,
-        most: int, most_at_root: int,
+        held: np.ndarray, piece: np.ndarray, rank: np.ndarray, most: int, most_at_root: int,
+        which: Any,
     ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-        """Where things on bodies `held` stand: `[rows, most, R]` and `[most_at_root, R]`."""
+        """Where `which` things on bodies `held` are: `[rows, most, R]`, `[most_at_root, R]`.
+
+        Past the end stands what has no effect.
+        """
         at_root = (assembly.parent[held] == 0) & (piece == 0)
-        # Past the end stands what has no effect.
         in_rows = np.full((rows, most, count), len(held))
         k = np.flatnonzero(which & ~at_root)
         row = order.place[order.first[held[k]] + piece[k]]
@@ -592,41 +577,28 @@ def _pick_rows(
         return in_rows, in_roots
 
     parts, root_parts = {}, {}
-    for group in capacity.groups:
-        own = np.zeros(len(order.piece), bool)
-        if group.laws in columns.laws:
-            own = columns.part_laws == columns.laws.index(group.laws)
-        parts[group.laws], root_parts[group.laws] = place(
-            own, columns.part_body, order.piece, order.rank, group.parts, group.root_parts
+    for laws, most, on_root in capacity.groups:
+        own = columns.part_laws == (columns.laws.index(laws) if laws in columns.laws else -1)
+        parts[laws], root_parts[laws] = place(
+            columns.part_body, order.piece, order.rank, most, on_root, own
         )
-    points = root_points = None
-    if capacity.points or capacity.root_points:
-        held, piece = columns.point_body, order.piece[assembly.point_part]
-        rank = _ranks(held * (1 + int(piece.max(initial=0))) + piece)
-        every = np.ones(len(held), bool)
-        points, root_points = place(every, held, piece, rank, capacity.points, capacity.root_points)
-        points = points if capacity.points else None
-        root_points = root_points if capacity.root_points else None
-    shells = root_shells = None
+    most, on_root = capacity.points, capacity.root_points
+    found = _find_points(columns, order)
+    points, root_points = place(*found[:3], most, on_root, most + on_root > 0)
+    found, part = _find_shells(columns, order), np.unique(pairs)
+    shells, root_shells = place(*found[:3], capacity.shells, capacity.root_shells, True)
+    table = np.concatenate([root_shells, shells.reshape(-1, count)])
+    shell, robot = np.nonzero(table < len(part))
+    number = np.zeros(len(part), int)
+    number[table[shell, robot]] = shell
+    blank = np.append(part, len(assembly.fluid.volume))
+    shells, root_shells = blank[shells], blank[root_shells]
+    owner = assembly.robot[columns.part_body[pairs[:, 0]]]
+    nth = _ranks(owner)
     met = np.zeros((2, capacity.meetings, count), int)
+    met[:, nth, owner] = number[np.searchsorted(part, pairs)].T
     rest = np.zeros((capacity.meetings, count))
-    if capacity.shells or capacity.root_shells:
-        part, held, piece, rank = _shell_places(order, assembly, pairs)
-        every = np.ones(len(held), bool)
-        most = capacity.shells, capacity.root_shells
-        in_rows, in_roots = place(every, held, piece, rank, *most)
-        table = np.concatenate([in_roots, in_rows.reshape(-1, count)])
-        shell, robot = np.nonzero(table < len(part))
-        number = np.zeros(len(part), int)
-        number[table[shell, robot]] = shell
-        ends = np.searchsorted(part, pairs)
-        owner = assembly.robot[held[ends[:, 0]]] if len(pairs) else np.zeros(0, int)
-        nth = _ranks(owner)
-        met[:, nth, owner] = number[ends].T
-        rest[nth, owner] = rest_overlaps(assembly, pairs)
-        blank = np.append(part, len(assembly.fluid.volume))
-        shells = blank[in_rows] if most[0] else None
-        root_shells = blank[in_roots] if most[1] else None
+    rest[nth, owner] = rest_overlaps(assembly, pairs)
     alike = _alike(columns, capacity.nothing)
     finish = lambda x: x[..., None, :]  # noqa: E731
     root = select_bodies(
@@ -665,16 +637,11 @@ def pack_bodies(
     Raises:
         InputError: a robot does not fit; the message says why.
     """
-    unique: dict[int, Robot] = {id(robot): robot for robot in robots}
-    place = {key: k for k, key in enumerate(unique)}
-    pick = np.array([place[id(robot)] for robot in robots], int)
-    assembly = assemble_all(list(unique.values()))
-    pairs = _list_pairs(list(unique.values()))
-    columns = read_constants(assembly, pairs)
-    order = order_rows(assembly, columns, capacity.groups)
-    _check_fit(assembly, columns, order, capacity)
-    _check_shells(assembly, order, pairs, capacity)
-    root, level, met, rest = _pick_rows(assembly, columns, capacity, order, pairs)
+    unique, pick = distinct(robots)
+    columns = _read_all(unique)
+    assembly, order = columns.assembly, order_rows(columns, capacity.groups)
+    _check_fit(columns, order, capacity)
+    root, level, met, rest = _pick_rows(columns, capacity, order)
     names = [str(body.name) for body in assembly.morphologies]
     real = np.zeros((capacity.rows, 1, len(names)), bool)
     real[order.place, 0, order.robot] = ~order.overflow
@@ -695,7 +662,7 @@ def pack_bodies(
             thrusters=read_thrusters(assembly, capacity.thrusters, capacity.curve_points),
             plant=replace(
                 _wire(assembly, hanging["row"], capacity),
-                mounts=place_types(assembly, _body_rows(order), capacity.sites, capacity.rows),
+                mounts=place_types(assembly, order.body_rows, capacity.sites, capacity.rows),
             ),
             figure=figures,
             first=met[0],
@@ -705,6 +672,13 @@ def pack_bodies(
         ),
     )
     return packed
+
+
+def distinct(robots: Sequence[Robot]) -> tuple[list[Robot], np.ndarray]:
+    """The different robots among some, and which of them each one is."""
+    unique = {id(robot): robot for robot in robots}
+    place = {key: k for k, key in enumerate(unique)}
+    return list(unique.values()), np.array([place[id(robot)] for robot in robots], int)
 
 
 def assemble_all(robots: Sequence[Robot]) -> Assembly:
@@ -739,8 +713,9 @@ class _Sizes(NamedTuple):
     root_parts: dict[PartLaws, np.ndarray]
 
 
-def _sizes(assembly: Assembly, columns: StepConstants) -> _Sizes:
+def _sizes(columns: StepConstants) -> _Sizes:
     """How large robots are."""
+    assembly = columns.assembly
     robots, nbody, roots = len(assembly.roots), len(assembly.parent), assembly.roots
 
     def most(held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -762,11 +737,10 @@ def _sizes(assembly: Assembly, columns: StepConstants) -> _Sizes:
     )
 
 
-def _check_fit(
-    assembly: Assembly, columns: StepConstants, order: RowOrder, capacity: Capacity
-) -> None:
+def _check_fit(columns: StepConstants, order: RowOrder, capacity: Capacity) -> None:
     """Refuses robots that are larger than there is room for."""
-    found, names = _sizes(assembly, columns), [str(body.name) for body in assembly.morphologies]
+    assembly = columns.assembly
+    found, names = _sizes(columns), [str(body.name) for body in assembly.morphologies]
     room = {group.laws for group in capacity.groups}
     for k, laws in enumerate(columns.laws):
         if laws not in room and not laws.idle:
@@ -795,31 +769,21 @@ def _check_fit(
             f"robot {names[order.robot[k]]!r}: expected at most as many parts on a body as the "
             f"examples have, as {assembly.world.drag} drags bodies as a whole; found more"
         )
-    touches = capacity.points or capacity.root_points
-    points, root_points = _count_points(assembly, order) if touches else (0, 0)
-    if points > capacity.points or root_points > capacity.root_points:
-        raise InputError(
-            f"robots: expected at most {capacity.points} contact points in a row and "
-            f"{capacity.root_points} at the core; found {points} and {root_points}"
-        )
-
-
-def _check_shells(
-    assembly: Assembly, order: RowOrder, pairs: np.ndarray, capacity: Capacity
-) -> None:
-    """Refuses robots with more boxes that can meet than there is room for."""
-    shells, root_shells = _count_shells(assembly, order, pairs)
-    if shells > capacity.shells or root_shells > capacity.root_shells:
-        raise InputError(
-            f"robots: expected at most {capacity.shells} boxes that can meet others in a row and "
-            f"{capacity.root_shells} at the core; found {shells} and {root_shells}"
-        )
-    robot = assembly.robot[assembly.fluid.body[pairs[:, 0]]]
-    most = int(np.bincount(robot, minlength=1).max())
-    if most > capacity.meetings:
-        raise InputError(
-            "robots", f"at most {capacity.meetings} pairs of boxes that can meet", most
-        )
+    room_for_points = capacity.points, capacity.root_points
+    points = _find_points(columns, order).most if any(room_for_points) else (0, 0)
+    shells = _find_shells(columns, order).most
+    for what, (in_row, on_root), (row, root) in (
+        ("contact points", points, room_for_points),
+        ("boxes that can meet others", shells, (capacity.shells, capacity.root_shells)),
+    ):
+        if in_row > row or on_root > root:
+            expected = f"at most {row} {what} in a row and {root} at the core"
+            raise InputError("robots", expected, f"{in_row} and {on_root}")
+    robot = assembly.robot[columns.part_body[columns.pairs[:, 0]]]
+    meetings = int(np.bincount(robot, minlength=1).max())
+    if meetings > capacity.meetings:
+        expected = f"at most {capacity.meetings} pairs of boxes that can meet"
+        raise InputError("robots", expected, meetings)
 
 
 def _leave_out(level: Level, constant: Level, names: list[str], real: Any) -> Level:
@@ -877,11 +841,6 @@ def _hang(assembly: Assembly, order: RowOrder, capacity: Capacity) -> dict[str, 
         "row": row,
         "count": order.length,
     }
-
-
-def _body_rows(order: RowOrder) -> np.ndarray:
-    """`[nbody]` which of its robot's rows each body's first one is; of roots anything."""
-    return order.place[np.clip(order.first, 0, None)] if len(order.place) else order.first
 
 
 def _wire(assembly: Assembly, row: np.ndarray, capacity: Capacity) -> Plant:

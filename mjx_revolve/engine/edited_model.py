@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import jax
 import mujoco
 import numpy as np
 
 from mjx_revolve.engine.assembly import Assembly
 from mjx_revolve.engine.step_constants import LIMIT_OVERSHOOT, StepConstants, motor_line
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.numerics.spatial import Scalar, quat_to_matrix
+from mjx_revolve.numerics.spatial import quat_to_matrix
 
 # What an edit must leave as it is: the tables of water and contact follow from it.
 _FIXED = (
@@ -83,37 +84,33 @@ def edited_constants(
     dof = model.jnt_dofadr[joint]
     effort = _limits(model.actuator_forcerange[act], model.actuator_forcelimited[act])
     target = _limits(model.actuator_ctrlrange[act], model.actuator_ctrllimited[act])
-    limited = model.jnt_limited[joint].astype(bool)[:, None]
     stops = np.stack([np.asarray(x, float)[2:] for x in constants.hinges.range], 1)
-    limits = np.where(limited, stops, [-np.inf, np.inf])
+    limits = _limits(stops, model.jnt_limited[joint])
     strong = np.where(np.isfinite(effort[:, 1]), effort[:, 1], 1.0)
-    motor = motor_line(model.jnt_user[joint, 0], effort[:, 1], model.dof_damping[dof])
+    ours, stiffness = constants.hinges, -model.actuator_biasprm[act, 1]
+    # Where a part of the spring was implicit, the limb takes no more of an explicit one.
+    implicit = np.asarray(ours.implicit_stiffness, float)[2:]
+    explicit = np.asarray(ours.stiffness, float)[2:] - implicit
+    edited = {
+        "armature": model.dof_armature[dof],
+        "damping": model.dof_damping[dof],
+        "gain": model.actuator_gainprm[act, 0],
+        "stiffness": stiffness,
+        "implicit_stiffness": np.where(implicit > 0, np.maximum(stiffness - explicit, 0.0), 0.0),
+        "servo_damping": -model.actuator_biasprm[act, 2],
+        "effort": tuple(effort.T),
+        "target": tuple(target.T),
+        "range": tuple(limits.T),
+        "stop": strong / LIMIT_OVERSHOOT,
+        "motor": motor_line(model.jnt_user[joint, 0], effort[:, 1], model.dof_damping[dof]),
+    }
+    built = {name: getattr(ours, name) for name in edited}
 
-    def filled(old: Scalar, new: np.ndarray) -> np.ndarray:
+    def filled(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+        """A column, behind the numbers of the world and the root."""
         return np.concatenate([np.asarray(old, float)[:2], new])
 
-    def pair(old: tuple[Scalar, Scalar], new: np.ndarray) -> tuple[Scalar, Scalar]:
-        return filled(old[0], new[:, 0]), filled(old[1], new[:, 1])
-
-    ours = constants.hinges
-    stiffness = filled(ours.stiffness, -model.actuator_biasprm[act, 1])
-    # Where a part of the spring was implicit, the limb takes no more of an explicit one.
-    implicit = np.asarray(ours.implicit_stiffness, float)
-    explicit = np.asarray(ours.stiffness, float) - implicit
-    hinges = ours._replace(
-        armature=filled(ours.armature, model.dof_armature[dof]),
-        damping=filled(ours.damping, model.dof_damping[dof]),
-        gain=filled(ours.gain, model.actuator_gainprm[act, 0]),
-        stiffness=stiffness,
-        implicit_stiffness=np.where(implicit > 0, np.maximum(stiffness - explicit, 0.0), 0.0),
-        servo_damping=filled(ours.servo_damping, -model.actuator_biasprm[act, 2]),
-        effort=pair(ours.effort, effort),
-        target=pair(ours.target, target),
-        range=pair(ours.range, limits),
-        stop=filled(ours.stop, strong / LIMIT_OVERSHOOT),
-        motor=(*pair(ours.motor[:2], np.stack(motor[:2], 1)), filled(ours.motor[2], motor[2])),
-    )
-    return constants._replace(hinges=hinges)
+    return constants._replace(hinges=ours._replace(**jax.tree.map(filled, built, edited)))
 
 
 def _limits(ranges: np.ndarray, limited: np.ndarray) -> np.ndarray:

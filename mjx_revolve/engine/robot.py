@@ -171,14 +171,11 @@ class Robot:
     @property
     def _actuators(self) -> list[bool]:
         """Which actuators turn hinges; they stand in the order of the modules."""
-        return [
-            hinge
-            for module in self.morphology.modules
-            for hinge in (
-                *((True,) if module.kind.hinge is not None else ()),
-                *(False for part in module.kind.parts if part.thruster is not None),
-            )
-        ]
+        found: list[bool] = []
+        for module in self.morphology.modules:
+            found += [True] * (module.kind.hinge is not None)
+            found += [False for part in module.kind.parts if part.thruster is not None]
+        return found
 
     @property
     def thruster_row(self) -> tuple[int, ...]:

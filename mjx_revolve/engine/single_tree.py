@@ -18,7 +18,7 @@ import numpy as np
 from mjx_revolve.body.placement import turned
 from mjx_revolve.engine.assembly import Assembly
 from mjx_revolve.engine.edited_model import edited_constants
-from mjx_revolve.engine.level import Level, PartLaws, Thrusters
+from mjx_revolve.engine.level import Level, Thrusters
 from mjx_revolve.engine.meetings import Boxes, Meetings
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.self_pairs import rest_overlaps
@@ -124,23 +124,16 @@ class SingleTree:
         """`[nhinge, lanes]` in the order of the levels."""
         if not self.below:
             return jnp.zeros((0, *like.shape), like.dtype)
-        # What is 0 for a whole level may be a plain number.
+        # What is the same for a whole level may be a plain number.
         pairs = zip(values, self.below, strict=True)
-        return jnp.concatenate(
-            [jnp.broadcast_to(x, (level.count, *like.shape)) for x, level in pairs]
-        )
+        wide = [jnp.broadcast_to(x, (level.count, *like.shape)) for x, level in pairs]
+        return jnp.concatenate(wide)
 
     def stack_saved(self, saved: Any, select: Callable[[Any], Any], like: jax.Array) -> Any:
         """`[nhinge, lanes]` of selected saved values; None without hinges."""
         if not self.below:
             return None
-
-        def join(*xs: Any) -> jax.Array:
-            pairs = zip(xs, self.below, strict=True)
-            wide = [jnp.broadcast_to(x, (level.count, *like.shape)) for x, level in pairs]
-            return jnp.concatenate(wide)
-
-        return jax.tree.map(join, *map(select, saved))
+        return jax.tree.map(lambda *xs: self.join_rows(xs, like), *map(select, saved))
 
     def at_lanes(self, which: jax.Array) -> SingleTree:
         """Itself: all lanes are this robot."""
@@ -303,40 +296,29 @@ def _make_level(
     columns: StepConstants, bodies: list[int], contact: bool, active: np.ndarray, root: bool
 ) -> tuple[Level, tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
     """One level; rows of the fluid table of its groups, of the points, and of the shells."""
-    held: dict[PartLaws, list[list[int]]] = {}
-    for k, body in enumerate(bodies):
-        for part in np.flatnonzero(columns.part_body == body):
-            lists = held.setdefault(columns.laws[columns.part_laws[part]], [[] for _ in bodies])
-            lists[k].append(int(part))
-    parts = {
-        laws: _stack(rows)
-        for laws, rows in held.items()
+
+    def stack(items: np.ndarray, owner: np.ndarray) -> np.ndarray:
+        """`[most, nbody]` of the items that bodies own, padded with -1, the column of nothing."""
+        lists = [items[owner[items] == body] for body in bodies]
+        return np.array([*itertools.zip_longest(*lists, fillvalue=-1)], int).reshape(-1, len(lists))
+
+    parts = {}
+    for k, laws in enumerate(columns.laws):
+        rows = stack(np.flatnonzero(columns.part_laws == k), columns.part_body)
         # Nothing acts on a group that neither floats nor drags nor carries nor pushes.
-        if not laws.idle or _carries(columns, rows)
-    }
-    points = None
-    if contact:
-        lists = [np.flatnonzero(columns.point_body == b).tolist() for b in bodies]
-        points = _stack(lists) if any(lists) else None
-    lists = [active[columns.part_body[active] == b].tolist() for b in bodies]
-    shells = _stack(lists) if any(lists) else None
+        if len(rows) and (not laws.idle or _carries(columns, rows)):
+            parts[laws] = rows
+    points = stack(np.arange(len(columns.point_body) * contact), columns.point_body)
+    shells = stack(active, columns.part_body)
     finish = lambda x: x[..., None] if x.dtype.kind == "i" else fold(x[..., None])  # noqa: E731
     level = select_bodies(
         columns, np.array(bodies), parts, points, shells, root, len(bodies), finish
     )
-    none = np.zeros((0, len(bodies)), int)
-    rows = tuple(parts[laws] for laws in sorted(parts))
-    return level, rows, none if points is None else points, none if shells is None else shells
+    return level, tuple(parts[laws] for laws in sorted(parts)), points, shells
 
 
-def _stack(lists: list[list[int]]) -> np.ndarray:
-    """`[nbody][k]` ragged to `[kmax, nbody]`, padded with -1, the column of nothing."""
-    most = max(len(row) for row in lists)
-    return np.array([[row[k] if k < len(row) else -1 for row in lists] for k in range(most)])
-
-
-def _carries(columns: StepConstants, lists: list[list[int]]) -> bool:
-    if columns.parts.carried is None:
-        return False
-    rows = [p for row in lists for p in row]
-    return any(np.any(x[rows]) for x in jax.tree.leaves(columns.parts.carried.inertia.linear))
+def _carries(columns: StepConstants, rows: np.ndarray) -> bool:
+    carried = columns.parts.carried
+    return carried is not None and any(
+        np.any(x[rows]) for x in jax.tree.leaves(carried.inertia.linear)
+    )

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from mjx_revolve.body.placement import turned
+from mjx_revolve.body.placement import counted, turned
 from mjx_revolve.engine.assembly import Assembly
-from mjx_revolve.engine.batch import Capacity, assemble_all, order_rows
+from mjx_revolve.engine.batch import Capacity, assemble_all, distinct, order_rows
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.step_constants import read_constants
 from mjx_revolve.inputs.errors import InputError
@@ -66,15 +66,8 @@ def sphere_box(half_size: Sequence[float]) -> tuple[np.ndarray, float]:
     return np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 3), radius
 
 
-class _Ball(NamedTuple):
+def _balls(assembly: Assembly) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Spheres of robots one behind the other: `[n]` body, `[n, 3]` centre, body frame, radius."""
-
-    body: np.ndarray
-    center: np.ndarray
-    radius: np.ndarray
-
-
-def _balls(assembly: Assembly) -> _Ball:
     table = assembly.fluid
     body, center, radius = [], [], []
     known: dict[tuple[float, ...], tuple[np.ndarray, float]] = {}
@@ -87,7 +80,7 @@ def _balls(assembly: Assembly) -> _Ball:
         center.append(table.position[k] + places @ table.rotation[k].T)
         radius += [size] * len(places)
     none = np.zeros((0, 3))  # of a robot that touches nothing
-    return _Ball(np.array(body, int), np.concatenate([none, *center]), np.array(radius, float))
+    return np.array(body, int), np.concatenate([none, *center]), np.array(radius, float)
 
 
 def pack_spheres(
@@ -107,43 +100,34 @@ def pack_spheres(
     Raises:
         InputError: a robot has more spheres than there is room for.
     """
-    unique: dict[int, Robot] = {id(robot): robot for robot in robots}
-    place = {key: k for k, key in enumerate(unique)}
-    pick = np.array([place[id(robot)] for robot in robots], int)
-    assembly = assemble_all(list(unique.values()))
+    unique, pick = distinct(robots)
+    assembly = assemble_all(unique)
     columns = read_constants(assembly)
-    order = order_rows(assembly, columns, capacity.groups)
-    balls = _balls(assembly)
-    owner, total = assembly.robot[balls.body], len(unique)
+    order = order_rows(columns, capacity.groups)
+    body, center, radius = _balls(assembly)
+    owner, total = assembly.robot[body], len(unique)
     counts = np.bincount(owner, minlength=total)
     room = count or int(counts.max())
     if np.any(counts > room):
         k = int(np.argmax(counts > room))
-        raise InputError(
-            f"robot {assembly.morphologies[k].name!r}: expected at most {room} spheres for "
-            f"contact; found {counts[k]}"
-        )
-    back = columns.frame.swapaxes(1, 2)
-    hinged = assembly.parent > 0
-    first = np.zeros(len(hinged), int)
-    first[hinged] = 1 + order.place[order.first[hinged]]
-    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    rank = np.arange(len(owner)) - starts[owner]
+        place = f"robot {assembly.morphologies[k].name!r}"
+        raise InputError(place, f"at most {room} spheres for contact", counts[k])
+    back, rank = columns.frame.swapaxes(1, 2), counted(counts)[1]
+    row = np.where(assembly.parent > 0, 1 + order.body_rows, 0)
 
     def table(values: np.ndarray) -> np.ndarray:
         found = np.zeros((room, total), values.dtype)
         found[rank, owner] = values
         return found
 
-    body = balls.body
-    center = turned(back[body], balls.center)
+    center = turned(back[body], center)
     own, where = np.unique(body, return_inverse=True)
     lightness = np.linalg.inv(back[own] @ assembly.inertia[own] @ columns.frame[own])[where]
     middle = turned(back[body], assembly.center[body])
     found = Spheres(
-        row=table(first[body].astype(np.int32)),
+        row=table(row[body].astype(np.int32)),
         center=tuple(table(center[:, i]) for i in range(3)),
-        radius=table(balls.radius),
+        radius=table(radius),
         mass_center=tuple(table(middle[:, i]) for i in range(3)),
         inverse_mass=table(1 / assembly.mass[body]),
         inverse_inertia=tuple(table(lightness[:, i, j]) for i, j in SYM),
@@ -157,4 +141,4 @@ def pack_spheres(
 
 def count_spheres(robots: Sequence[Robot]) -> int:
     """The most spheres that any of some robots has."""
-    return max((len(_balls(robot.assembly).body) for robot in robots), default=0)
+    return max((len(_balls(robot.assembly)[0]) for robot in robots), default=0)

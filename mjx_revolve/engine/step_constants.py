@@ -58,9 +58,11 @@ NO_LIMIT = 1e30
 
 
 class StepConstants(NamedTuple):
-    """Leaves are NumPy arrays, component by component.
+    """Numbers are NumPy arrays, component by component.
 
     Attributes:
+        assembly: the robots.
+        pairs: `[pairs, 2]` parts of one robot that can meet, rows of the fluid table.
         hinges: `[nbody]`, by the moving bodies; 0, the world, is nothing, and so is a root's.
         bodies: `[nbody]` mass, moment and inertia, and the inertia box or None.
         bounds: `[nbody]` of the drag's gradient.
@@ -73,6 +75,8 @@ class StepConstants(NamedTuple):
         frame: `[nbody, 3, 3]` body frame from the step's own frame, which has z along the hinge.
     """
 
+    assembly: Assembly
+    pairs: np.ndarray
     hinges: Hinges
     bodies: tuple[Any, ...]
     bounds: DragBound
@@ -169,6 +173,8 @@ def read_constants(assembly: Assembly, pairs: np.ndarray = _NO_PAIRS) -> StepCon
         if isinstance(law, PartDragLaw)
     }
     return StepConstants(
+        assembly=assembly,
+        pairs=pairs,
         hinges=_read_hinges(assembly, frame, pairs),
         bodies=_read_bodies(assembly, frame),
         bounds=_read_bounds(assembly, frame, drags, numbers),
@@ -492,8 +498,8 @@ def select_bodies(
     columns: StepConstants,
     bodies: np.ndarray,
     parts: dict[PartLaws, np.ndarray],
-    points: np.ndarray | None,
-    shells: np.ndarray | None,
+    points: np.ndarray,
+    shells: np.ndarray,
     root: bool,
     count: int,
     finish: Any,
@@ -506,8 +512,8 @@ def select_bodies(
         bodies: `[...]` which columns of the bodies.
         parts: of each group, which columns of the parts, `[..., npart, ...]` with the parts on the
             axis before the last.
-        points: which columns of the points, laid out alike, or None.
-        shells: which columns of the parts may meet others of the robot, laid out alike, or None.
+        points: which columns of the points, laid out alike.
+        shells: which columns of the parts may meet others of the robot, laid out alike.
         root: whether they are roots, which no hinge carries.
         count: how many bodies move together.
         finish: what becomes of each picked array.
@@ -531,16 +537,13 @@ def select_bodies(
         )
         picked = jax.tree.map(take(index), own)
         groups.append(replace(picked, laws=laws, count=index.shape[-2]))
-    touching = None
-    if points is not None and columns.points is not None:
+    touching, boxes = None, None
+    if points.shape[-2] and columns.points is not None:
         touching = Points(points.shape[-2], *jax.tree.map(take(points), columns.points))
-    boxes = None
-    if shells is not None:
+    if shells.shape[-2]:
         own = columns.parts
-        boxes = Shells(
-            shells.shape[-2],
-            *jax.tree.map(take(shells), (own.position, own.rotation, own.half_size)),
-        )
+        shapes = own.position, own.rotation, own.half_size
+        boxes = Shells(shells.shape[-2], *jax.tree.map(take(shells), shapes))
     return Level(
         count=count,
         hinges=None if root else jax.tree.map(take(bodies), columns.hinges),

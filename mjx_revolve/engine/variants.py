@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from mjx_revolve.engine.batch import distinct
 from mjx_revolve.engine.population import PopulationEngine, tree_plant
 from mjx_revolve.engine.robot import Robot, check_timestep
 from mjx_revolve.engine.single_tree import SingleTree, make_single_tree
@@ -46,10 +47,9 @@ class Variants:
 
     def stack(self, robots: Sequence[Robot]) -> list[np.ndarray]:
         """The numbers that differ, `[..., robots]` each; of robots that repeat, read once."""
-        once = {id(robot): robot for robot in robots}
-        read = {key: jax.tree.leaves(_numbers(_tree(robot, self.prescribed)))
-                for key, robot in once.items()}  # fmt: skip
-        leaves = [read[id(robot)] for robot in robots]
+        unique, pick = distinct(robots)
+        read = [jax.tree.leaves(_numbers(_tree(robot, self.prescribed))) for robot in unique]
+        leaves = [read[k] for k in pick]
         found = []
         for row in self.rows:
             each = np.broadcast_arrays(*(np.asarray(x[row]) for x in leaves))
@@ -94,32 +94,29 @@ def _tree(robot: Robot, prescribed: np.ndarray) -> SingleTree:
     tree: SingleTree = make_single_tree.__wrapped__(robot, robot.world.bed is not None)
     if not prescribed.any():
         return tree
+    rate = _RETURN / robot.world.timestep
+    stiffness = _DRIVEN_INERTIA * rate**2
+    course: dict[str, Any] = {
+        "armature": _DRIVEN_INERTIA,
+        "damping": 0.0,
+        "gain": stiffness,
+        "stiffness": stiffness,
+        "implicit_stiffness": 0.0,
+        "servo_damping": 2 * _DRIVEN_INERTIA * rate,
+        "effort": (-NO_LIMIT, NO_LIMIT),
+        "target": (-NO_LIMIT, NO_LIMIT),
+        "range": (-NO_LIMIT, NO_LIMIT),
+        "stop": 0.0,
+        "motor": (NO_LIMIT, 0.0, 1.0),
+    }
     below, done = [], 0
     for level in tree.below:
         assert level.hinges is not None
         driven = prescribed[tree.hinge_order[done : done + level.count]][:, None]
         done += level.count
-        rate = _RETURN / robot.world.timestep
-        stiffness = _DRIVEN_INERTIA * rate**2
-        free, none = (-NO_LIMIT, NO_LIMIT), 0.0
-
-        def put(now: Any, value: Any, driven: np.ndarray = driven) -> Any:
-            return jax.tree.map(lambda a, b: fold(np.asarray(np.where(driven, b, a))), now, value)
-
-        hinges = level.hinges
-        changed = hinges._replace(
-            armature=put(hinges.armature, _DRIVEN_INERTIA),
-            damping=put(hinges.damping, none),
-            gain=put(hinges.gain, stiffness),
-            stiffness=put(hinges.stiffness, stiffness),
-            implicit_stiffness=put(hinges.implicit_stiffness, none),
-            servo_damping=put(hinges.servo_damping, 2 * _DRIVEN_INERTIA * rate),
-            effort=put(hinges.effort, free),
-            target=put(hinges.target, free),
-            range=put(hinges.range, free),
-            stop=put(hinges.stop, none),
-            motor=put(hinges.motor, (NO_LIMIT, none, 1.0)),
-        )
+        put = lambda a, b, driven=driven: fold(np.asarray(np.where(driven, b, a)))  # noqa: E731
+        own = {name: getattr(level.hinges, name) for name in course}
+        changed = level.hinges._replace(**jax.tree.map(put, own, course))
         below.append(replace(level, hinges=changed))
     return replace(tree, below=tuple(below))
 

@@ -268,14 +268,27 @@ NO_DRAG = Drag(ZERO, ZERO, None)
 
 
 @dataclass(frozen=True)
-class DragLaw:
-    """What all drag laws have.
+class Law:
+    """What all laws have.
 
     Attributes:
         name: its name in world and module files.
         summary: one line for documents.
         mjcf: what an MJCF file can say of it.
         sdf: what an SDF file can say of it.
+    """
+
+    name: str
+    summary: str
+    mjcf: Export
+    sdf: Export
+
+
+@dataclass(frozen=True)
+class DragLaw(Law):
+    """What all drag laws have.
+
+    Attributes:
         explicit: whether a step takes it explicitly, which limits the time step.
         varied: whether `task.robust` varies it.
         steepest: bound g of the force's gradient: its derivative by the speed v is at most g ρ A v,
@@ -289,10 +302,6 @@ class DragLaw:
         mj_fluidcoef: MuJoCo's `fluidcoef`, if MuJoCo's geoms have this law under that attribute.
     """
 
-    name: str
-    summary: str
-    mjcf: Export
-    sdf: Export
     explicit: bool = False
     varied: bool = True
     steepest: float | Callable[[Any], np.ndarray] | None = None
@@ -349,14 +358,10 @@ class BodyDragLaw(DragLaw):
 
 
 @dataclass(frozen=True)
-class BuoyancyLaw:
+class BuoyancyLaw(Law):
     """A rule for how much of a part the surface leaves under water.
 
     Attributes:
-        name: its name in world and module files.
-        summary: one line for documents.
-        mjcf: what an MJCF file can say of it.
-        sdf: what an SDF file can say of it.
         submersion: (vertical in the part's axes, depth of the box's centre [m], half edges [m]) →
             submerged fraction [-], and fraction times centre of the submerged piece, from the box's
             centre, part's axes [m].
@@ -364,10 +369,6 @@ class BuoyancyLaw:
             either way.
     """
 
-    name: str
-    summary: str
-    mjcf: Export
-    sdf: Export
     submersion: Callable[[Vec, Scalar, Vec], tuple[Scalar, Vec]]
     lifts: bool = True
 

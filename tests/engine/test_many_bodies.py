@@ -163,7 +163,7 @@ def test_more_padding_and_more_overflow_rows_change_nothing():
     groups = tuple(g._replace(parts=1, root_parts=1) for g in capacity.groups)
     points = dict.fromkeys(("points", "root_points"), 8 if capacity.points else 0)
     single = resize_capacity(capacity, rows=40, slots=5, groups=groups, **points)
-    order = order_rows(robots[0].assembly, read_constants(robots[0].assembly), groups)
+    order = order_rows(read_constants(robots[0].assembly), groups)
     assert order.length[0] == len(robots[0].fluid.volume) - 1
     assert np.sum(order.overflow & (order.body == 1)) > 0
     again = mixed_acceleration(robots, single, 4, arrays)
@@ -203,7 +203,7 @@ def test_a_short_stack_holds_any_tree():
         columns = read_constants(assembly)
         for parts, root in ((1, 99), (2, 99), (5, 99), (2, 1), (3, 4)):
             groups = [PartGroup(laws, parts, root) for laws in columns.laws]
-            rows = order_rows(assembly, columns, groups)
+            rows = order_rows(columns, groups)
             assert 2 ** (rows.slot.max() + 1) - 1 <= rows.length[0] + 1 == len(rows.slot) + 1
             stack = {0: 1}  # the root
             each = zip(rows.body, rows.overflow, rows.source, rows.slot, strict=True)
