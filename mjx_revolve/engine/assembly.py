@@ -206,7 +206,13 @@ def assemble(morphologies: Sequence[Morphology], world: World) -> Assembly:
     axis = np.array([(0.0, 0.0, 1.0) if h is None else h.axis for h in hinges])
     damping = FRICTION * effort / speed
     stiffness = effort / FULL_TORQUE_ERROR
-    most = _most_explicit_stiffness(mass, center, inertia, axis, damping, world)
+    # MuJoCo's Euler step takes the servo's spring explicitly and the joint's friction d implicitly;
+    # it is well damped while k dt² is at most 1.7 (I + d dt). Only hinges that carry next to
+    # nothing have stiffer servos. Drag that is extrapolated explicitly feeds what rings in a few
+    # steps, so that springs are taken implicitly earlier there; a choice: with less nothing is won.
+    about = np.sum(axis * turned(inertia + _steiner(mass, center), axis), 1)
+    dt, share = world.timestep, 0.5 if is_extrapolated(world.drag) else 1.7
+    most = share * (about / dt**2 + damping / dt)
     pushing = np.array([part.thruster is not None for part in layout.parts])[layout.kind]
     return Assembly(
         morphologies=tuple(morphologies),
@@ -272,24 +278,3 @@ def _steiner(mass: np.ndarray, arm: np.ndarray) -> np.ndarray:
     square = np.sum(arm**2, 1)[:, None, None] * np.eye(3)
     about: np.ndarray = mass[:, None, None] * (square - arm[:, :, None] * arm[:, None])
     return about
-
-
-def _most_explicit_stiffness(
-    mass: np.ndarray,
-    center: np.ndarray,
-    inertia: np.ndarray,
-    axis: np.ndarray,
-    damping: np.ndarray,
-    world: World,
-) -> np.ndarray:
-    """`[nbody]` the stiffest springs of servos that an explicit step of the limb takes.
-
-    MuJoCo's Euler step takes the servo's spring explicitly and the joint's friction d implicitly;
-    it is well damped while k dt² is at most 1.7 (I + d dt). Only hinges that carry next to nothing
-    have stiffer servos. Drag that is extrapolated explicitly feeds what rings in a few steps, so
-    that springs are taken implicitly earlier there; a choice: with less nothing is won.
-    """
-    about = np.sum(axis * turned(inertia + _steiner(mass, center), axis), 1)
-    dt, share = world.timestep, 0.5 if is_extrapolated(world.drag) else 1.7
-    most: np.ndarray = share * (about / dt**2 + damping / dt)
-    return most

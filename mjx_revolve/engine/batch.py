@@ -687,19 +687,15 @@ def assemble_all(robots: Sequence[Robot]) -> Assembly:
         raise InputError("robots", "at least one", "none")
     for robot in robots:
         if robot.as_edited().edited_model is not None:
-            raise InputError(
-                f"robot {robot.morphology.name!r}: expected it as built, as batches of robots have "
-                "no edited models; found one from with_model"
-            )
+            expected = "it as built, as batches of robots have no edited models"
+            raise InputError(f"robot {robot.morphology.name!r}", expected, "one from with_model")
     first, *rest = robots
     if not rest:
         return first.assembly
     for robot in rest:
         if robot.world is not first.world and robot.world != first.world:
-            raise InputError(
-                f"robot {robot.morphology.name!r}: expected the world of "
-                f"{first.morphology.name!r}; found another one"
-            )
+            expected = f"the world of {first.morphology.name!r}"
+            raise InputError(f"robot {robot.morphology.name!r}", expected, "another one")
     return assemble([robot.morphology for robot in robots], first.world)
 
 

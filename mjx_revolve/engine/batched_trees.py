@@ -113,6 +113,11 @@ class BatchedTrees:
         return self._own(_merged(self.capacity.root, self.bodies.root))
 
     @property
+    def _rows(self) -> Level:
+        """Constants of the rows, `[rows, 1, lanes]`, without the variation."""
+        return _merged(self.capacity.row, self.bodies.rows)
+
+    @property
     def thrusters(self) -> Thrusters:
         """Of the robots, `[nthruster, lanes]`."""
         own = self.bodies.thrusters
@@ -183,7 +188,7 @@ class BatchedTrees:
 
     def hinge_positions(self, which: jax.Array) -> Vec:
         """Of each lane, or one for all."""
-        hinges = _merged(self.capacity.row, self.bodies.rows).hinges
+        hinges = self._rows.hinges
         assert hinges is not None
         shape = self.capacity.rows, 1, 1 if self.bodies.alike else self.lanes
         wide = lambda x: jnp.broadcast_to(jnp.asarray(x, self.table.data.dtype), shape)  # noqa: E731
@@ -206,9 +211,8 @@ class BatchedTrees:
 
     def fully_submerged(self, lanes: tuple[int, ...], dtype: Any) -> tuple[Any, Any]:
         """`[npart, 1, lanes]` of the root and `[rows, npart, 1, lanes]` of the rows."""
-        row, count = _merged(self.capacity.row, self.bodies.rows), self.capacity.rows
-        axes = 3 if self.world.near_surface else 1
-        below = row.at_first(axes, (1, *lanes), dtype)
+        count, axes = self.capacity.rows, 3 if self.world.near_surface else 1
+        below = self._rows.at_first(axes, (1, *lanes), dtype)
         every = tuple(jnp.broadcast_to(x, (count, *x.shape)) for x in below)
         return self.root.at_first(axes, (1, *lanes), dtype), every
 
@@ -216,7 +220,7 @@ class BatchedTrees:
 
     def map(self, fun: Callable[..., Any], *xs: Any) -> Any:
         """`fun` for all rows at once."""
-        return fun(self._own(_merged(self.capacity.row, self.bodies.rows)), *xs)
+        return fun(self._own(self._rows), *xs)
 
     def forward_pass(self, fun: Callable[..., Any], root: Any, *xs: Any) -> Any:
         """Row after row from the roots."""

@@ -41,10 +41,9 @@ def check_edit(model: mujoco.MjModel, built: mujoco.MjModel, name: str) -> None:
                   for x in ("timestep", "gravity")]  # fmt: skip
         changed = [x for x, new, old in pairs if not np.allclose(new, old, atol=1e-9)]
     if changed:
-        raise InputError(
-            f"model of {name!r}: expected other masses, inertias, hinges or servos only; found "
-            f"another {', '.join(changed)} (edit the morphology or the world instead)"
-        )
+        expected = "other masses, inertias, hinges or servos only"
+        found = f"another {', '.join(changed)} (edit the morphology or the world instead)"
+        raise InputError(f"model of {name!r}", expected, found)
 
 
 def edited_assembly(assembly: Assembly, model: mujoco.MjModel) -> Assembly:

@@ -8,6 +8,7 @@ own has the world's.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -170,6 +171,10 @@ def make_fluid_table(
         value = np.minimum(np.multiply(value, factor), c.high)
         return np.broadcast_to(value, 3) if c.per_axis else value
 
+    def column(look: Callable[[Part], Any]) -> np.ndarray:
+        """`[npart, ...]` the same as numbers."""
+        return np.array([look(p) for p in parts])[kind]
+
     half = np.array([p.boxes[0].size for p in parts]) / 2
     mass, inertia = box_added_mass(half)
     coefficients = {c.name: np.array([given(p, c) for p in parts]) for _, c in list_coefficients()}
@@ -181,10 +186,8 @@ def make_fluid_table(
     added_mass = reached * (scale * mass)[kind]
     # Water that turns about an axis is pushed by the four faces beside it.
     added_inertia = beside(reached) / 2 * (scale * inertia)[kind]
-    stated = np.array([p.fossen is not None for p in parts])[kind]
-    known = np.array([_ZERO_MATRIX if p.fossen is None else p.fossen.added_mass for p in parts])[
-        kind
-    ]
+    stated = column(lambda p: p.fossen is not None)
+    known = column(lambda p: _ZERO_MATRIX if p.fossen is None else p.fossen.added_mass)
     known = known / (world.density or np.inf)
     factors = {
         name: np.array([dict(p.factors).get(name, 1.0) for p in parts])[kind]
@@ -197,11 +200,9 @@ def make_fluid_table(
     added_mass = np.where(stated[:, None], diagonal[:, :3], more * added_mass)
     added_inertia = np.where(stated[:, None], diagonal[:, 3:], more * added_inertia)
     # Where the core states the water of all of its robot, other parts have none.
-    whole = np.array([p.fossen is not None and p.fossen.whole for p in parts])[kind]
+    whole = column(lambda p: p.fossen is not None and p.fossen.whole)
     replaced = np.isin(layout.body, layout.body[whole]) & ~whole
-    added_mass, added_inertia = (
-        np.where(replaced[:, None], 0.0, x) for x in (added_mass, added_inertia)
-    )
+    added_mass[replaced] = added_inertia[replaced] = 0.0
     drag = each([drag_law(p, world) for p in parts])
     if replaced.any() and world.drag != ELLIPSOID.name:  # MuJoCo's laws are for all parts
         drag = tuple("off" if r else name for r, name in zip(replaced, drag, strict=True))
@@ -216,9 +217,9 @@ def make_fluid_table(
         rotation=rotation,
         half_size=half[kind],
         center_of_volume=np.array([p.displaced_center for p in parts], float)[kind],
-        volume=np.array([p.total_volume for p in parts])[kind],
-        mass=np.array([p.total_mass for p in parts])[kind],
-        silhouette=np.array([p.face_areas for p in parts])[kind],
+        volume=column(lambda p: p.total_volume),
+        mass=column(lambda p: p.total_mass),
+        silhouette=column(lambda p: p.face_areas),
         exposed=exposed,
         joined=joined,
         ends=ends,

@@ -31,13 +31,11 @@ class Boxes(NamedTuple):
     def of(levels: Sequence[Level], dtype: Any) -> Boxes:
         """The shells of levels, one behind the other."""
         found = []
-        every = [level.shells.rotation for level in levels if level.shells is not None]
-        square = all(_is_identity(x) for x in every)
-        for level in levels:
-            if level.shells is not None:
-                own = level.shells
-                numbers = Boxes(own.position, None if square else own.rotation, own.half_size)
-                found.append(jax.tree.map(partial(_flat, level, own.count, dtype), numbers))
+        every = [(level, level.shells) for level in levels if level.shells is not None]
+        square = all(_is_identity(own.rotation) for _, own in every)
+        for level, own in every:
+            numbers = Boxes(own.position, None if square else own.rotation, own.half_size)
+            found.append(jax.tree.map(partial(_flat, level, own.count, dtype), numbers))
         lanes = max(x.shape[-1] for x in jax.tree.leaves(found))
         wide = lambda x: jnp.broadcast_to(x, (len(x), lanes))  # noqa: E731
         joined: Boxes = jax.tree.map(lambda *x: jnp.concatenate(list(map(wide, x))), *found)

@@ -81,6 +81,8 @@ class _Flow(NamedTuple):
     """How an individual moves, seen from the uniform current.
 
     Attributes:
+        model: MJX's.
+        data: MJX's, of pose and velocity; contacts see the velocity over the ground.
         qpos: `[nq]`.
         qvel: `[nv]`.
         ahead: `[nv]` half a step ahead, for the water's forces and momenta that turn.
@@ -90,6 +92,8 @@ class _Flow(NamedTuple):
             `[nbody, 6, nv]`, or a zero without carried water; see `dynamics.accelerate`.
     """
 
+    model: Any
+    data: Any
     qpos: jax.Array
     qvel: jax.Array
     ahead: jax.Array
@@ -312,26 +316,24 @@ def _step(
     current, acceleration = (
         jnp.stack([zero + x for x in xs]) for xs in (water.current, water.acceleration)
     )
-    data, flow = _start(plan, model, qpos, qvel, qacc_prev, current, acceleration)
-    matrices = _rigid(plan, model, data, flow)
+    flow = _start(plan, model, qpos, qvel, qacc_prev, current, acceleration)
+    matrices = _rigid(plan, flow)
     fractions = []
     for level, before in enumerate(submerged):
-        matrices, fraction = _add_water(
-            plan, model, data, flow, matrices, level, water, thrusts, before
-        )
+        matrices, fraction = _add_water(plan, flow, matrices, level, water, thrusts, before)
         fractions.append(fraction)
     damping = jnp.asarray(plan.robot.mj_model.dof_damping * plan.dt, qpos.dtype)
     matrices = matrices._replace(mass=matrices.mass + jnp.diag(damping))
     power = zero
     # Tips to root, as in the articulated-body algorithm: a servo needs the inertia that it moves.
     for level in reversed(range(1, len(plan.tree.all))):
-        matrices, spent = _add_servos(plan, model, data, flow, matrices, level, ctrl)
+        matrices, spent = _add_servos(plan, flow, matrices, level, ctrl)
         power = power + spent
     kind = "gen" if plan.tree.carries else "pos"
     rates = jax.scipy.linalg.solve(matrices.mass, matrices.force, assume_a=kind)
     if plan.solves:
         smooth = rates.at[:3].add(acceleration)
-        push = _contact_force(model, data, matrices.mass, smooth)
+        push = _contact_force(flow, matrices.mass, smooth)
         rates = rates + jax.scipy.linalg.solve(matrices.mass, push, assume_a=kind)
     return *_advance(plan, flow, rates, current), tuple(fractions), power
 
@@ -344,8 +346,8 @@ def _start(
     qacc_prev: Any,
     current: Any,
     acceleration: Any,
-) -> tuple[Any, _Flow]:
-    """What follows from pose and velocity; contacts see the velocity over the ground."""
+) -> _Flow:
+    """What follows from pose and velocity."""
     seen, qvel = qvel, qvel.at[:3].add(-current)
     # Momenta that turn, and the water's forces, are those half a step ahead (see `dynamics`).
     ahead = qvel + 0.5 * plan.dt * qacc_prev.at[:3].set(_rows(qpos) @ qacc_prev[:3])
@@ -370,7 +372,7 @@ def _start(
     if plan.tree.carries:
         swing = _swing(plan, model, data, ahead)
         drift = [x - y @ qacc_prev for x, y in zip(drift, swing, strict=True)]
-    return data, _Flow(qpos, qvel, ahead, acceleration, drift, swing)
+    return _Flow(model, data, qpos, qvel, ahead, acceleration, drift, swing)
 
 
 def _jacobians(plan: MjxEngine, model: Any, data: Any, level: int) -> tuple[Any, Any]:
@@ -391,9 +393,9 @@ def _swing(plan: MjxEngine, model: Any, data: Any, ahead: Any) -> list[jax.Array
     return [_jacobians(plan, model, rates, k)[0] for k in range(len(plan.tree.all))]
 
 
-def _rigid(plan: MjxEngine, model: Any, data: Any, flow: _Flow) -> _Matrices:
+def _rigid(plan: MjxEngine, flow: _Flow) -> _Matrices:
     """MuJoCo's own mass matrix and forces, the hinges' friction among them."""
-    mass = support.full_m(model, data)
+    data, mass = flow.data, support.full_m(flow.model, flow.data)
     friction = jnp.asarray(plan.robot.mj_model.dof_damping, flow.qpos.dtype)
     resisted = flow.qvel if plan.tree.carries else 0.0
     force = data.qfrc_passive - data.qfrc_bias - friction * resisted
@@ -403,8 +405,6 @@ def _rigid(plan: MjxEngine, model: Any, data: Any, flow: _Flow) -> _Matrices:
 
 def _add_water(
     plan: MjxEngine,
-    model: Any,
-    data: Any,
     flow: _Flow,
     matrices: _Matrices,
     level: int,
@@ -418,10 +418,10 @@ def _add_water(
     """
     tree, dt, world = plan.tree, plan.dt, plan.tree.world
     constants, drift = tree.all[level], flow.drift[level]
-    jacobian, axes = _jacobians(plan, model, data, level)
+    jacobian, axes = _jacobians(plan, flow.model, flow.data, level)
     rate, rate_ahead = (jnp.einsum("bij,j->bi", jacobian, v) for v in (flow.qvel, flow.ahead))
     column = lambda x: tuple(x[:, i, None] for i in range(3))  # noqa: E731
-    place = data.xpos[jnp.asarray(tree.bodies[level])]
+    place = flow.data.xpos[jnp.asarray(tree.bodies[level])]
     midpoint = column(rate_ahead[:, :3]), column(rate_ahead[:, 3:])
     motion = BodyMotion(
         angular_velocity=column(rate[:, :3]),
@@ -469,7 +469,7 @@ def _add_water(
 
 
 def _add_servos(
-    plan: MjxEngine, model: Any, data: Any, flow: _Flow, matrices: _Matrices, level: int, ctrl: Any
+    plan: MjxEngine, flow: _Flow, matrices: _Matrices, level: int, ctrl: Any
 ) -> tuple[_Matrices, Any]:
     """End stops and servos of a level's hinges, and the servos' power."""
     v, hinges = plan.columns[level - 1], plan.tree.all[level].hinges
@@ -477,7 +477,7 @@ def _add_servos(
     angle, speed = flow.qpos[v + 1][:, None], flow.qvel[v][:, None]
     mass, force = matrices
     moved_inertia, load = [], []
-    jacobian_of, _ = _jacobians(plan, model, data, level)
+    jacobian_of, _ = _jacobians(plan, flow.model, flow.data, level)
     for j, jacobian, drifting in zip(v, jacobian_of, flow.drift[level], strict=True):
         below, row, load_j = plan.descendants[j], mass[j], force[j]
         if len(below):
@@ -544,7 +544,7 @@ def _options(options: Any, solves: bool) -> Any:
     )
 
 
-def _contact_force(model: Any, data: Any, mass: jax.Array, smooth: jax.Array) -> jax.Array:
+def _contact_force(flow: _Flow, mass: jax.Array, smooth: jax.Array) -> jax.Array:
     """Generalised force of the bed on the robot, by MJX's constraint solver.
 
     MuJoCo's contact model (Todorov 2014, Convex and analytically-invertible dynamics with contacts
@@ -561,8 +561,7 @@ def _contact_force(model: Any, data: Any, mass: jax.Array, smooth: jax.Array) ->
     contact.
 
     Args:
-        model: MJX's.
-        data: with contacts and constraints from the velocity over the ground.
+        flow: of the step.
         mass: `[nv, nv]` of the step, not symmetric.
         smooth: `[nv]` acceleration without contact, over the ground.
 
@@ -570,9 +569,9 @@ def _contact_force(model: Any, data: Any, mass: jax.Array, smooth: jax.Array) ->
         `[nv]` force [N, N·m].
     """
     inertia = 0.5 * (mass + mass.T)
-    data = data.tree_replace({"_impl.M": inertia})
+    data = flow.data.tree_replace({"_impl.M": inertia})
     data = data.replace(qacc_smooth=smooth, qfrc_smooth=inertia @ smooth)
-    return solver.solve(model, data).qfrc_constraint
+    return solver.solve(flow.model, data).qfrc_constraint
 
 
 def _stack(components: Any, n: int) -> jax.Array:
@@ -602,10 +601,8 @@ def _matrix(m: Any, n: int) -> jax.Array:
 
 def _dense(inertia: SpatialInertia, n: int) -> jax.Array:
     """A spatial inertia as `[nbody, 6, 6]`."""
-    angular, cross, linear = (
-        jnp.stack([_stack(row, n) for row in block], -2)
-        for block in (full(inertia.angular), inertia.cross, full(inertia.linear))
-    )
+    blocks = full(inertia.angular), inertia.cross, full(inertia.linear)
+    angular, cross, linear = (_matrix(block, n) for block in blocks)
     top = jnp.concatenate([angular, cross], -1)
     bottom = jnp.concatenate([jnp.swapaxes(cross, 1, 2), linear], -1)
     return jnp.concatenate([top, bottom], -2)

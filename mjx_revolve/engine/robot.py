@@ -104,10 +104,9 @@ class Robot:
         """
         spec = self._compiled[0]
         if spec is None:
-            raise InputError(
-                f"mj_spec of {self.morphology.name!r}: expected a robot as built, or from "
-                "with_model(spec); found one from with_model(model) or from another process"
-            )
+            expected = "a robot as built, or from with_model(spec)"
+            found = "one from with_model(model) or from another process"
+            raise InputError(f"mj_spec of {self.morphology.name!r}", expected, found)
         return spec.copy()
 
     @property
@@ -315,10 +314,8 @@ def check_timestep(robot: Robot, engine: str = "population") -> None:
     """
     bed = robot.world.bed
     if bed is not None and bed.contact == "mjx" and engine != "mjx":
-        raise InputError(
-            f"bed.contact: expected 'penalty' with engine: {engine}; found 'mjx' (choose engine: "
-            "mjx, or contact: penalty)"
-        )
+        found = "'mjx' (choose engine: mjx, or contact: penalty)"
+        raise InputError("bed.contact", f"'penalty' with engine: {engine}", found)
     meeting = robot.assembly.meeting_pairs
     if len(meeting) and engine == "mjx":
         rows = robot.fluid.module[meeting[0]]

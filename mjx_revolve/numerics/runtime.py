@@ -333,6 +333,4 @@ def describe_process() -> dict[str, object]:
 
 def usable_cores() -> int:
     """The number of CPU cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(list_cores()) or os.cpu_count() or 1

@@ -157,19 +157,14 @@ def check_wave(wave: Wave, gravity: float, water_depth: float | None, place: str
     k = wave.wavenumber(gravity, water_depth)
     length = 2 * math.pi / k
     if length < 0.999 * _SHORTEST:
-        raise ConstraintError(
-            f"{place}.period",
-            f"that of a wave of at least {_SHORTEST:g} m",
-            f"{wave.period:g} s, a wave of {length:.3g} m",
-        )
+        expected = f"that of a wave of at least {_SHORTEST:g} m"
+        found = f"{wave.period:g} s, a wave of {length:.3g} m"
+        raise ConstraintError(f"{place}.period", expected, found)
     # Miche 1944 (Dean & Dalrymple 1991, § 4.8): height over length where crests break.
     highest = 0.142 * length * (1.0 if water_depth is None else math.tanh(k * water_depth))
     if 2 * wave.amplitude > highest:
-        raise ConstraintError(
-            f"{place}.amplitude",
-            f"at most {highest / 2:.3g}, or a wave {length:.4g} m long breaks",
-            f"{wave.amplitude:g}",
-        )
+        expected = f"at most {highest / 2:.3g}, or a wave {length:.4g} m long breaks"
+        raise ConstraintError(f"{place}.amplitude", expected, f"{wave.amplitude:g}")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -205,9 +200,8 @@ class CurrentField:
                 _check_axis(name, array)
                 shape.append(len(array))
             elif array.shape != (*shape, 3):
-                raise InputError(
-                    "velocity", f"shape {[*shape, 3]}, as x, y and z have it", list(array.shape)
-                )
+                expected = f"shape {[*shape, 3]}, as x, y and z have it"
+                raise InputError("velocity", expected, list(array.shape))
             if not np.all(np.isfinite(array)):
                 raise InputError(name, "finite numbers", "NaN or infinity")
             array += 0.0  # -0.0 and 0.0 are one number

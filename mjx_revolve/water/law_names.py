@@ -83,9 +83,8 @@ def _read_coefficients(value: Any) -> Any:
             raise ConstraintError("", f"names of coefficients {names}", show(name))
         c, plain = known[name], isinstance(number, int | float) and not isinstance(number, bool)
         if not plain or not c.low <= number <= min(c.high, LARGEST):
-            raise ConstraintError(
-                name, f"a number from {c.low:g} to {c.high:g} [{c.unit}]", show(number)
-            )
+            expected = f"a number from {c.low:g} to {c.high:g} [{c.unit}]"
+            raise ConstraintError(name, expected, show(number))
     return tuple(sorted(given.items()))
 
 

@@ -74,9 +74,8 @@ class Thruster:
         }
         for name, given in strange.items():
             if given:
-                raise ConstraintError(
-                    name, f"none with curve {self.curve}", show(getattr(self, name))
-                )
+                expected = f"none with curve {self.curve}"
+                raise ConstraintError(name, expected, show(getattr(self, name)))
         points = len(self.commands), len(self.thrusts)
         if line and (points[0] < 2 or points[0] != points[1]):
             pairs = "as many as thrusts, two or more"
