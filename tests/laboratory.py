@@ -146,14 +146,25 @@ def check_engines(robot: Robot, qpos: np.ndarray, qvel: np.ndarray, ctrl: np.nda
     assert other_work == pytest.approx(work, abs=1e-9)
 
 
+def refusal(function: Callable[..., Any], *given: Any, **more: Any) -> str:
+    """What the `InputError` says in which a call ends."""
+    with pytest.raises(InputError) as error:
+        function(*given, **more)
+    return str(error.value)
+
+
 def check_refused(
     message: str, function: Callable[..., Any], *given: Any, start: str = "", **more: Any
 ) -> None:
     """A call ends in an `InputError` of one line, with a message in it and a start."""
-    with pytest.raises(InputError) as error:
-        function(*given, **more)
-    found = str(error.value)
+    found = refusal(function, *given, **more)
     assert message in found and found.startswith(start) and "\n" not in found, found
+
+
+def check_error(captured: Any, message: str) -> None:
+    """A command has said one line, an error with a message in it, and nothing else."""
+    assert captured.out == "" and captured.err.startswith("error: ")
+    assert message in captured.err and captured.err.count("\n") == 1
 
 
 def with_motors(robot: Robot, factor: float) -> Robot:

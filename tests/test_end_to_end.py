@@ -96,4 +96,3 @@ def test_wrong_input_is_one_line_and_code_2():
     assert run.returncode == 2 and not run.stdout  # before JAX is loaded
     assert run.stderr.count("\n") == 1
     assert run.stderr.startswith("error: ") and "expected one of empty_underwater" in run.stderr
-    assert "Traceback" not in run.stderr

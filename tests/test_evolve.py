@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import toys
+from laboratory import check_error
 from mjx_revolve import evolve as command
 from mjx_revolve.episodes.champion import load_genes
 from mjx_revolve.evolution import run as beginning
@@ -179,9 +180,7 @@ def test_a_run_stays_the_same_run(stopped, argv, message, capsys):
     (stopped / "run" / ".lock").unlink()  # as where the folder was copied
     assert run_main("--resume", "run", *argv) == 2
     assert not (stopped / "run" / ".lock").exists()
-    err = capsys.readouterr().err
-    assert message in err
-    assert err.count("\n") == 1
+    check_error(capsys.readouterr(), message)
 
 
 def test_a_changed_robot_or_config_is_noticed(stopped, capsys, monkeypatch):
@@ -216,10 +215,7 @@ def test_wrong_commands_leave_nothing_behind(folder, argv, message, capsys):
     (folder / "full" / "file").touch()
     before = sorted(folder.rglob("*"))
     assert run_main(*argv) == 2
-    err = capsys.readouterr().err
-    assert err.startswith("error: ")
-    assert message in err
-    assert err.count("\n") == 1
+    check_error(capsys.readouterr(), message)
     assert sorted(folder.rglob("*")) == before
 
 

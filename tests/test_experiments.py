@@ -26,7 +26,7 @@ from experiments.falling_spider import (
     mean_acceleration,
     read_run,
 )
-from laboratory import ROOT
+from laboratory import ROOT, check_error
 from mjx_revolve.inputs.commands import run_command
 
 THESIS = ROOT.parent / "shared" / "thesis"
@@ -92,20 +92,12 @@ def test_on_the_simulators_clock_the_data_are_the_closed_form(readings):
         (gpu.main, ["--robot", "tiger"], "--robot: expected a shipped morphology; found 'tiger'"),
         (shipped.main, ["--only", "moon"], "--only: expected any of auv_escape, "),
         (validation.main, ["--quick", "--results"], "--results: expected all of the study; found"),
-        (
-            senses.main,
-            ["--only", "lake_target", "--results"],
-            "--results: expected all",
-        ),
+        (senses.main, ["--only", "lake_target", "--results"], "--results: expected all"),
     ],
 )
 def test_bad_options_end_with_one_line_and_code_2(main, arguments, message, capsys):
     assert run_command(main, arguments) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith("error: ")
-    assert captured.err.count("\n") == 1
-    assert message in captured.err
+    check_error(capsys.readouterr(), message)
 
 
 def _result(name, rates, population=2048, peak=2.0**20):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from laboratory import OURS, ROOT, body, check_refused, write
+from laboratory import OURS, ROOT, body, check_refused, refusal, write
 from mjx_revolve.body.catalogue import MODULES, THESIS_MODULES, LiftDrag
 from mjx_revolve.body.coefficients import read_morphology_files
 from mjx_revolve.body.exposure import exposure
@@ -493,9 +493,7 @@ body:
 
 
 def test_overlapping_modules_are_named(tmp_path):
-    with pytest.raises(InputError) as error:
-        read(tmp_path, RING)
-    assert str(error.value) == (
+    assert refusal(read, tmp_path, RING) == (
         f"{tmp_path / 'robot.yaml'}: body: expected modules that do not overlap at rest; found "
         "overlapping: Core0 and c, Core0 and d (allow_overlap loads them all the same)"
     )

@@ -31,8 +31,6 @@ from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.flow import water_of
 
 NAMES = ("spider", "fish", "snake")
-
-
 pytestmark = pytest.mark.usefixtures("float64")
 
 

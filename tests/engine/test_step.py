@@ -21,6 +21,7 @@ from laboratory import (
     face_drag,
     limp,
     march,
+    oar_robot,
     random_states,
     read,
     world,
@@ -37,8 +38,6 @@ from references import Lagrangian, rotation
 
 RHO, G = 999.1026, 9.81
 CUBE = (0.1, 0.1, 0.1)  # carries the same water along every axis, so no Munk moment turns it
-
-
 pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 
@@ -444,6 +443,19 @@ def test_gradient_in_waves_and_in_contact():
         "qvel": np.array([0.1, 0.05, -0.02, 0.1, 0.05, 0.2]),
     }
     check_slope(build_robot(body("core"), tank), afloat, sliding)
+
+
+@pytest.mark.long
+def test_gradient_of_a_jointed_body():
+    """In a joint's target and speed, too; half out of the water."""
+    inputs = {
+        "place": np.array([0.0, 0.0, -0.005]),
+        "ctrl": np.array([0.03]),
+        "qvel": np.array([0.1, -0.05, 0.02, 0.1, 0.2, 0.1, 0.5]),
+        # Not the body's own speed: there |v|, of which drag's implicit part is made, has its kink.
+        "current": np.array([0.12, 0.0, 0.0]),
+    }
+    check_slope(oar_robot(world(**WATER)), inputs)
 
 
 @pytest.mark.long

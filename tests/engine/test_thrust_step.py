@@ -30,8 +30,6 @@ from mjx_revolve.water.world import load_world
 RHO, G = 999.1026, 9.81
 CUBE = (0.1, 0.1, 0.1)
 NEUTRAL = RHO * 1e-3
-
-
 pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import ROOT, body, make_track
+from laboratory import ROOT, body, make_track, refusal
 from mjx_revolve import InputError, make_fitness, make_mixed_fitness
 from mjx_revolve.episodes.config import load_config, make_config
 from mjx_revolve.episodes.measure_table import MEASURES, records_of
@@ -187,11 +187,9 @@ def test_names_are_read_written_and_checked(tmp_path):
     json.dumps(config.model_dump())
     assert make_config(config.model_dump(), "/").task == config.task
     assert load_config(base).task.measures == ()
-    with pytest.raises(InputError) as caught:
-        load_config(base, ["task.measures=[gait_frequency]"])
-    assert str(caught.value).endswith(
-        "; found 'gait_frequency'; did you mean gait_frequency_hz?"
-    ) and str(caught.value).startswith("--set task.measures.0: expected one of speed_bl_s, ")
+    found = refusal(load_config, base, ["task.measures=[gait_frequency]"])
+    assert found.startswith("--set task.measures.0: expected one of speed_bl_s, ")
+    assert found.endswith("; found 'gait_frequency'; did you mean gait_frequency_hz?")
     with pytest.raises(InputError, match=r"task\.measures: expected a list .*; found 'tilt_rad'"):
         load_config(base, ["task.measures=tilt_rad"])
 

@@ -89,8 +89,6 @@ CHASED = {
     "task.duration": 2.0, "task.settle": 0.2, "task.trials": 2, "task.target_distance": 0.4,
     "task.target_turn": 1.0,
 }  # fmt: skip
-
-
 pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 

@@ -23,8 +23,6 @@ body:
   children:
     1: {type: ActiveHinge, children: {1: {type: FixedBrick, children: {1: {type: ActiveHinge}}}}}
 """
-
-
 pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 

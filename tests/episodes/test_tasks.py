@@ -40,8 +40,6 @@ lifting = Task(lift, "N", records=("forces",))
 standing = Task(stand, "N", records=("contacts",), start=start_on_bed, on_bed=True)
 bending = Task(bend, "rad", records=("core", "joints"))
 """
-
-
 pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 

@@ -28,8 +28,6 @@ TASK = {
     "start_position": 0.1,
 }
 SENSORS = ["tilt", {"type": "depth", "noise": 0.1}, "accelerometer", "angle", "speed"]
-
-
 pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 

@@ -30,8 +30,6 @@ BRAINS = {
     "sensory_cpg": {"sensors": SENSORS},
     "feedback": {},
 }
-
-
 pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from laboratory import ROOT, WILD
+from laboratory import ROOT, WILD, refusal
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import load_morphology, make_morphology, save_morphology
 from mjx_revolve.body.placement import find_overlaps
@@ -210,23 +210,21 @@ def test_the_space_says_what_it_refuses():
 def test_spaces_are_made_of_types_that_there_are():
     config = bodies_config.BodiesConfig
 
-    def refusal(**settings):
-        with pytest.raises(InputError) as error:
-            make_space(config(**settings), MODULES)
-        return str(error.value)
+    def refused(**settings):
+        return refusal(make_space, config(**settings), MODULES)
 
-    assert refusal(modules=("FixedBrick", "Brick")).startswith(
+    assert refused(modules=("FixedBrick", "Brick")).startswith(
         "bodies.modules.1: expected one of ActiveHinge, Fin, FixedBrick, "
     )
-    assert refusal(modules=("Core", "ActiveHinge")).endswith("found 'Core'")
-    assert refusal(core="FixedBrick") == (
+    assert refused(modules=("Core", "ActiveHinge")).endswith("found 'Core'")
+    assert refused(core="FixedBrick") == (
         "bodies.core: expected one of BlueROV2, Core, CoreComponent; found 'FixedBrick'"
     )
-    assert refusal(modules=("TouchSensor", "ActiveHinge", "FixedBrickSensor")) == (
+    assert refused(modules=("TouchSensor", "ActiveHinge", "FixedBrickSensor")) == (
         "bodies.modules.2: expected each type once; found 'TouchSensor' again"
     )
-    assert refusal(modules=("FixedBrick",)).startswith("bodies.modules: expected a type with a hin")
-    assert refusal(max_of={"Fin": 1}) == (
+    assert refused(modules=("FixedBrick",)).startswith("bodies.modules: expected a type with a hin")
+    assert refused(max_of={"Fin": 1}) == (
         "bodies.max_of: expected any of bodies.modules, FixedBrick, ActiveHinge; found Fin"
     )
     assert make_space(config(modules=ALL, max_of={"FixedBrickSensor": 1}), MODULES).max_of == {

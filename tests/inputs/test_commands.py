@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from laboratory import ROOT
+from laboratory import ROOT, check_error
 from mjx_revolve.inputs.commands import (
     Parser,
     check_place,
@@ -72,9 +72,7 @@ def test_wrong_arguments_are_one_line_and_code_2(argv, message, capsys):
     parser.add_argument("--rate", type=whole(1, 9))
     parser.add_argument("--count", type=whole(1))
     assert run_command(lambda argv: parser.parse_args(argv) and 0, argv) == 2
-    captured = capsys.readouterr()
-    assert captured.err.startswith(f"error: {message}") and captured.err.count("\n") == 1
-    assert captured.out == ""
+    check_error(capsys.readouterr(), f"error: {message}")
 
 
 FULL = OSError(errno.ENOSPC, "No space left on device", "a.xml")

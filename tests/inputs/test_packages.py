@@ -5,9 +5,9 @@ from importlib import metadata
 
 import pytest
 
+from laboratory import refusal
 from mjx_revolve.inputs import packages
 from mjx_revolve.inputs.commands import run_command
-from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.packages import REQUIREMENTS, check_mujoco, check_package
 
 
@@ -15,10 +15,9 @@ from mjx_revolve.inputs.packages import REQUIREMENTS, check_mujoco, check_packag
 def test_a_missing_package_is_named_with_its_remedy(module, monkeypatch):
     check_package("here", "json")
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(InputError) as error:
-        check_package("here", module)
     remedy = f"(pip install '{REQUIREMENTS[module]}')"
-    assert str(error.value) == f"here: expected the package {module}; found none {remedy}"
+    expected = f"here: expected the package {module}; found none {remedy}"
+    assert refusal(check_package, "here", module) == expected
 
 
 def of_mujoco(monkeypatch, **found):

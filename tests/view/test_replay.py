@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from laboratory import body
+from laboratory import body, check_error
 from mjx_revolve import replay
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.champion import Episode
@@ -439,5 +439,4 @@ def test_page_alone_needs_no_opengl(command, tmp_path, monkeypatch):
 def test_wrong_options(words, message, tmp_path, capsys):
     (tmp_path / "spider.yaml").touch()
     assert run_command(replay.main, [str(tmp_path / "spider.yaml"), *words]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1 and error.startswith("error: ")
+    check_error(capsys.readouterr(), message)

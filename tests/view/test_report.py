@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from laboratory import _ELBOW as ELBOW
+from laboratory import check_error
 from mjx_revolve import evolve, inspect, passport, report
 from mjx_revolve.episodes.config import load_config, make_config
 from mjx_revolve.episodes.fitness import make_fitness
@@ -467,8 +468,6 @@ def test_wrong_commands(copy, argv, message, capsys):
     (copy / "report.html").write_text("mine")
     before = sorted(copy.parent.rglob("*"))
     assert run_main(*argv) == 2
-    err = capsys.readouterr().err
-    assert message in err
-    assert err.startswith("error: ") and err.count("\n") == 1
+    check_error(capsys.readouterr(), message)
     assert sorted(copy.parent.rglob("*")) == before
     assert (copy / "report.html").read_text() == "mine"
