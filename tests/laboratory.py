@@ -7,8 +7,9 @@ discretisation errs by and not what float32 rounds to.
 import copy
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +29,22 @@ from experiments.water_tank import (
 )
 from mjx_revolve.body.morphology import Morphology, load_morphology
 from mjx_revolve.control.controller import Controller
-from mjx_revolve.control.readings import SensorReadings
+from mjx_revolve.control.readings import (
+    EpisodeContext,
+    SensorReadings,
+    init_memory,
+    read_sensors,
+)
+from mjx_revolve.engine.batch import Capacity, pack_bodies
+from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.plant import Plant
+from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.episodes.tasks import Track
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.xla import OLD_EMITTERS, on_cpu
 from mjx_revolve.water.face_drag import FACES, FaceNumbers
+from mjx_revolve.water.flow import water_of
 from mjx_revolve.water.world import World
 
 __all__ = ["accelerate", "at_rest", "box_robot", "march", "world"]
@@ -134,6 +144,61 @@ def compiled_quickly() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
         yield
+
+
+def batch_engine(
+    robots: Sequence[Robot], capacity: Capacity, lanes: int, kind: Any = np.float64
+) -> PopulationEngine:
+    """The step for different bodies side by side."""
+    bodies = pack_bodies(robots, capacity, kind)
+    trees = make_batched_trees(robots[0].world, capacity, bodies, lanes)
+    return PopulationEngine(trees, jax.tree.map(jnp.asarray, bodies.plant))
+
+
+def sensed(
+    engine_of: Callable[[], Any], tank: World, after: Any, ctrl: Any, signals: Any,
+    cues: EpisodeContext, before: Any = None, time: float = 0.0,
+) -> tuple[SensorReadings, np.ndarray]:  # fmt: skip
+    """What is felt after a step, in float64, as NumPy; and the plant's rows."""
+    with jax.enable_x64(True):
+
+        def run(before: Any, after: Any, ctrl: Any) -> Any:
+            engine, now = engine_of(), jnp.asarray(time)
+            memory = init_memory(signals, engine, engine.init(*before))
+            memory = memory._replace(ctrl=engine.plant.arrange(ctrl))
+            state, water = engine.init(*after), water_of(tank)
+            found = read_sensors(tank, engine, state, water, now, cues, memory, signals)
+            return found._replace(noise=None), engine.plant.source
+
+        arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), (before or after, after, ctrl))
+        found, source = jax.jit(run, compiler_options=QUICK)(*arrays)
+        return jax.tree.map(np.asarray, found), np.asarray(source)
+
+
+def play(
+    controller: Controller, plant: Plant, genes: Any, steps: int, sense: Any, start: int = 0
+) -> tuple[np.ndarray, Any]:
+    """`[steps, n, lanes]` targets of a controller, and its states, in float64, at 200 Hz."""
+    with jax.enable_x64(True):
+
+        def run(genes: Any, sense: Any) -> Any:
+            parameters = controller.decode(genes, plant)
+
+            def step(state: Any, k: Any) -> Any:
+                state, target = controller.step(parameters, state, 0.005 * (start + k), sense)
+                return state, (target, state)
+
+            return jax.lax.scan(step, controller.init(parameters), jnp.arange(steps))[1]
+
+        given = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), (genes, sense))
+        found: tuple[np.ndarray, Any] = jax.tree.map(np.asarray, jax.jit(run)(*given))
+        return found
+
+
+@lru_cache
+def dry_robot(name: str) -> Robot:
+    """One of the shipped robots in a world of nothing."""
+    return build_robot(body(name), world())
 
 
 def check_engines(robot: Robot, qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray) -> None:

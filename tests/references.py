@@ -4,6 +4,7 @@ import itertools
 
 import mujoco
 import numpy as np
+import pytest
 
 from mjx_revolve.water.bed import bed_height
 
@@ -101,6 +102,16 @@ class Lagrangian:
         """½ v · B v."""
         return qvel @ self.inertia(qpos) @ qvel / 2
 
+    def impulse(self, qpos, qvel):
+        """Linear and angular impulse of body and water, the latter about the world's origin.
+
+        Momenta of the root's six coordinates are those of the whole, in its velocities' frames.
+        """
+        momentum = self.inertia(qpos) @ qvel
+        turn = rotation(qpos[3:7] / np.linalg.norm(qpos[3:7]))
+        spin = turn @ momentum[3:6] + np.cross(qpos[:3], momentum[:3])
+        return np.concatenate([momentum[:3], spin])
+
     def force(self, qpos, qvel, qacc, step=1e-5):
         """`[nv]` generalised force that this motion needs (Hamel's form of Lagrange's equations).
 
@@ -130,6 +141,80 @@ def clearance(robot, qpos):
         corner = corner + np.einsum("nij,nj->ni", turn, robot.contact_position)
         found.append(np.min(corner[:, 2] - bed_height(robot.world.bed, *corner[:, :2].T)))
     return np.array(found)
+
+
+def mujoco_sensors(robot, names, after, qacc, ctrl):
+    """What MuJoCo's sensors say in the middle of modules' main boxes, `[lanes, dim]` by (id, kind).
+
+    Its accelerations are those given: the water's are none of its own.
+    """
+    spec, kinds, objects = robot.mj_spec.copy(), mujoco.mjtSensor, mujoco.mjtObj
+    modules = {module.name: module for module in robot.morphology.modules}
+    for name in names:
+        module, model = modules[name], robot.mj_model
+        part = module.kind.parts[0 if module.kind.hinge is None else -1].name
+        geom = model.geom(f"{name}/{part}")
+        owner = spec.body(model.body(int(geom.bodyid[0])).name)
+        owner.add_site(name=name, pos=geom.pos, quat=geom.quat)
+        # A ray goes along z: this one is turned downwards, state by state.
+        owner.add_site(name=f"{name}/down", pos=geom.pos)
+        site, joint = objects.mjOBJ_SITE, objects.mjOBJ_JOINT
+        frames = ("framepos", "framexaxis", "frameyaxis", "framezaxis", "framelinvel")
+        for kind in ("gyro", "accelerometer", "velocimeter", *frames):
+            what = getattr(kinds, f"mjSENS_{kind.upper()}")
+            spec.add_sensor(name=f"{name} {kind}", type=what, objtype=site, objname=name)
+        what, at = kinds.mjSENS_RANGEFINDER, f"{name}/down"
+        distance = [1, 0, 0]  # of what a ray may tell
+        spec.add_sensor(
+            name=f"{name} rangefinder", type=what, objtype=site, objname=at, intprm=distance
+        )
+        if module.kind.hinge is not None:
+            at = model.joint(int(model.body(name).jntadr[0])).name
+            for kind, what in (
+                ("jointpos", kinds.mjSENS_JOINTPOS),
+                ("jointvel", kinds.mjSENS_JOINTVEL),
+                ("jointactuatorfrc", kinds.mjSENS_JOINTACTFRC),
+            ):
+                spec.add_sensor(name=f"{name} {kind}", type=what, objtype=joint, objname=at)
+    model = spec.compile()
+    model.geom_rgba[[model.geom(k).name != "bed" for k in range(model.ngeom)], 3] = 0  # no ray
+    data, found = mujoco.MjData(model), {}
+    for lane in range(ctrl.shape[1]):
+        data.qpos[:], data.qvel[:] = after[0][:, lane], after[1][:, lane]
+        data.ctrl[list(robot.servos)] = ctrl[:, lane]
+        mujoco.mj_kinematics(model, data)
+        for name in names:
+            site, quat = model.site(f"{name}/down"), np.zeros(4)
+            down = data.xmat[int(site.bodyid[0])].reshape(3, 3).T @ (0, 0, -1)
+            mujoco.mju_quatZ2Vec(quat, down)
+            model.site_quat[site.id], model.site_sameframe[site.id] = quat, 0
+        mujoco.mj_forward(model, data)
+        data.qacc[:] = qacc[:, lane]
+        mujoco.mj_rnePostConstraint(model, data)
+        mujoco.mj_sensorAcc(model, data)
+        for k in range(model.nsensor):
+            name, kind = model.sensor(k).name.rsplit(" ", 1)
+            found.setdefault((name, kind), []).append(data.sensor(k).data.copy())
+    return {key: np.array(rows) for key, rows in found.items()}
+
+
+def check_mujocos_steps(model, qpos, qvel, ctrl, found, close):
+    """Steps of lanes are `mj_step`'s, so close in place and speed; `[lanes, na]` at the end."""
+    data, ends = mujoco.MjData(model), []
+    for lane in range(qpos.shape[1]):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[:, lane], qvel[:, lane], ctrl[:, lane]
+        for q, v in zip(*found, strict=True):
+            mujoco.mj_step(model, data)
+            assert data.qpos == pytest.approx(q[:, lane], abs=close[0])
+            assert data.qvel == pytest.approx(v[:, lane], abs=close[1])
+        ends.append(data.act.copy())
+    return np.array(ends)
+
+
+def each_lane(function, qpos, qvel):
+    """A function of one state, of every lane."""
+    return np.array([function(*state) for state in zip(qpos.T, qvel.T, strict=True)])
 
 
 def rotation(quat):

@@ -1,15 +1,12 @@
 """Controllers from genes to targets, and the servos that follow them."""
 
 from dataclasses import replace
-from functools import lru_cache
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from laboratory import ROOT, WATER, at_rest, body, elbow_robot, march, read, world
+from laboratory import ROOT, WATER, at_rest, dry_robot, elbow_robot, march, play, read, world
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.control.cpg import make_cpg
@@ -25,29 +22,6 @@ EFFORT, SPEED = 0.17658, 5.235988
 STILL = SensorReadings(0.0, 0.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
 
 
-@lru_cache
-def robot_of(name):
-    return build_robot(body(name), world())
-
-
-def play(robot, controller, genes, steps, dt=0.005, order=None):
-    """`[steps, nu, lanes]` targets and the controller's states, in float64."""
-    plant = plant_of(robot, order)
-
-    @jax.jit
-    def run(genes):
-        parameters = controller.decode(genes, plant)
-
-        def step(state, k):
-            state, target = controller.step(parameters, state, k * dt, STILL)
-            return state, (target, state)
-
-        return jax.lax.scan(step, controller.init(parameters), jnp.arange(steps))[1]
-
-    with jax.enable_x64(True):
-        return jax.tree.map(np.asarray, run(jnp.asarray(genes, jnp.float64)))
-
-
 def drawn(controller, lanes=4, seed=0, scale=1.5):
     return scale * np.random.default_rng(seed).normal(size=(controller.num_genes, lanes))
 
@@ -61,7 +35,7 @@ MAKERS = {
 
 @pytest.mark.parametrize("name", ["spider", "gecko", "snake", "centipede", "core"])
 def test_the_number_of_genes_follows_from_the_body(name):
-    robot = robot_of(name)
+    robot = dry_robot(name)
     n, pairs = robot.num_hinges, len(robot.morphology.hinge_neighbours())
     assert make_cpg(robot).num_genes == n + pairs
     assert make_sine(robot).num_genes == 3 * n + 1
@@ -73,7 +47,7 @@ def test_a_sine_begins_at_rest_also_where_ranges_are_not_even():
     uneven = MODULES | {"ActiveHinge": replace(MODULES["ActiveHinge"], hinge=hinge)}
     robot = build_robot(load_morphology(ROOT / "morphologies" / "snake.yaml", uneven), world())
     controller = make_sine(robot)
-    targets, _ = play(robot, controller, drawn(controller, 1), 101)
+    targets, _ = play(controller, plant_of(robot), drawn(controller, 1), 101, STILL)
     assert not targets[0].any() and targets[-1].all()
 
 
@@ -83,7 +57,7 @@ def described(robot, genes, **settings):
 
 def test_a_sines_gait():
     """Two of eight hinges swing, a quarter of a turn apart, by sin .5 and sin .3 of their range."""
-    robot = robot_of("spider")
+    robot = dry_robot("spider")
     genes = np.zeros(25)
     genes[0], genes[8 + 3], genes[-1] = 0.5, 0.3, np.pi / 6  # u of one, v of another, f = 1.5 Hz
     a, b = np.sin([0.5, 0.3]) * np.pi / 4
@@ -102,7 +76,7 @@ def test_a_sines_gait():
 
 def test_an_uncoupled_cpgs_gait():
     """x = sin(w t), half of it backwards; w = 2π f_max sin(gene)."""
-    robot = robot_of("spider")
+    robot = dry_robot("spider")
     genes = np.zeros(18)
     genes[:2], genes[2] = np.pi / 6, -np.pi / 2  # 1 Hz, 1 Hz and 2 Hz backwards
     found = described(robot, genes, type="cpg", amplitude=0.5)
@@ -136,9 +110,9 @@ def test_two_coupled_oscillators_gait():
 @pytest.mark.parametrize("amplitude", [1.0, 0.4])
 def test_targets_stay_within_the_range(kind, amplitude):
     """CPG and plain sine by themselves; offsets and harmonics add up, and the servo clips them."""
-    robot = robot_of("spider")
+    robot = dry_robot("spider")
     controller = MAKERS[kind](robot, amplitude=amplitude)
-    targets, _ = play(robot, controller, drawn(controller, 64, scale=5.0), 800)
+    targets, _ = play(controller, plant_of(robot), drawn(controller, 64, scale=5.0), 800, STILL)
     widest = {"cpg": 1.0, "sine": 1.5, "sine3": 0.5 + 1 + 1 / 2 + 1 / 3}[kind]
     assert np.abs(targets).max() <= widest * amplitude * np.pi / 4 + 1e-9
     assert np.abs(targets).max() > 0.5 * amplitude * np.pi / 4
@@ -157,18 +131,18 @@ def test_a_coupled_pair_against_the_matrix_exponential():
     genes = np.array([[0.7], [-0.4], [0.9]])
     w, c = 2 * np.pi * np.sin(genes[:2, 0]), np.pi * np.sin(0.9)
     matrix = np.array([[0, c, w[0], 0], [-c, 0, 0, w[1]], [-w[0], 0, 0, 0], [0, -w[1], 0, 0]])
-    _, (x, y) = play(robot, controller, genes, 400)
+    _, (x, y) = play(controller, plant_of(robot), genes, 400, STILL)
     expected = expm(matrix * 2.0) @ [0, 0, 1, 1]
     assert np.concatenate([x[-1, :, 0], y[-1, :, 0]]) == pytest.approx(expected, abs=1e-5)
 
 
 def test_sine_is_a_sine():
     """a sin(2π f t + φ) + offset after the fade: amplitude and phase from a point in the plane."""
-    robot = robot_of("spider")
+    robot = dry_robot("spider")
     controller = make_sine(robot, max_frequency=1.2)
     genes = np.zeros((25, 1))
     genes[0], genes[8], genes[16], genes[24] = 0.5, -0.8, 0.3, 0.6
-    targets, _ = play(robot, controller, genes, 600)
+    targets, _ = play(controller, plant_of(robot), genes, 600, STILL)
     time = 0.005 * np.arange(600)
     size, phase = np.hypot(0.5, 0.8), np.arctan2(-0.8, 0.5)
     frequency = 1.2 * (1 + np.sin(0.6)) / 2

@@ -3,11 +3,11 @@
 import re
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
 
+import laboratory
 from laboratory import check_refused, read, world
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.control.kinds import find_controller
@@ -67,15 +67,10 @@ def robot():
 
 def play(robot, genes, steps, sense):
     """`[steps, nhinge]` targets, in float64."""
-    plant = plant_of(robot)
     with jax.enable_x64(True):
-        controller = make_neural_network(plant, robot.morphology)
-        sense = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), sense)
+        controller = make_neural_network(plant_of(robot), robot.morphology)
         genes = np.zeros(controller.num_genes) if genes is None else genes
-        parameters = controller.decode(jnp.asarray(genes, jnp.float64)[:, None], plant)
-        step = lambda state, k: controller.step(parameters, state, k * DT, sense)  # noqa: E731
-        run = jax.jit(lambda: jax.lax.scan(step, controller.init(parameters), jnp.arange(steps)))
-        return np.asarray(run()[1])[..., 0]
+        return laboratory.play(controller, plant_of(robot), genes[:, None], steps, sense)[0][..., 0]
 
 
 def felt():

@@ -12,29 +12,30 @@ from laboratory import (
     WATER,
     arm_robot,
     at_rest,
+    batch_engine,
     body,
     box_robot,
     check_refused,
     elbow_robot,
     march,
     read,
+    sensed,
     world,
 )
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.sensors import Sensor, SensorRow
-from mjx_revolve.control.readings import EpisodeContext, init_memory, read_sensors
+from mjx_revolve.control.readings import EpisodeContext
 from mjx_revolve.control.sensors import DEFAULT_SENSORS, make_observer, resolve_sensors
-from mjx_revolve.engine.batch import fit_capacity, pack_bodies
-from mjx_revolve.engine.batched_trees import make_batched_trees
+from mjx_revolve.engine.batch import fit_capacity
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.plant import plant_of
-from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.config import OLDER, OLDER_TASK, make_config
 from mjx_revolve.evolution.fingerprints import settings_hash
 from mjx_revolve.inputs import schema
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.flow import water_of
+from references import mujoco_sensors
 
 DT, LANES = 1e-4, 2
 # A current along x, and one along y that fades to nothing 20 m down.
@@ -74,76 +75,8 @@ def moving(robot, seed):
 
 
 def felt(engine_of, before, after, ctrl, signals=ASKED):
-    """The senses after a step, in float64, as NumPy; and the plant's rows."""
-    with jax.enable_x64(True):
-
-        def run(before, after, ctrl):
-            engine = engine_of()
-            memory = init_memory(signals, engine, engine.init(*before))
-            memory = memory._replace(ctrl=engine.plant.arrange(ctrl))
-            state, water = engine.init(*after), water_of(SEA)
-            cues = EpisodeContext(target=tuple(TARGET))
-            found = read_sensors(SEA, engine, state, water, jnp.zeros(()), cues, memory, signals)
-            return found._replace(noise=None), engine.plant.source
-
-        arrays = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), (before, after, ctrl))
-        found, source = jax.jit(run, compiler_options=QUICK)(*arrays)
-        return jax.tree.map(np.asarray, found), np.asarray(source)
-
-
-def mujocos(robot, names, after, qacc, ctrl):
-    """What MuJoCo's sensors say in the middle of modules' main boxes, `[lanes, dim]` by (id, kind).
-
-    Its accelerations are those given: the water's are none of its own.
-    """
-    spec, kinds, objects = robot.mj_spec.copy(), mujoco.mjtSensor, mujoco.mjtObj
-    modules = {module.name: module for module in robot.morphology.modules}
-    for name in names:
-        module, model = modules[name], robot.mj_model
-        part = module.kind.parts[0 if module.kind.hinge is None else -1].name
-        geom = model.geom(f"{name}/{part}")
-        owner = spec.body(model.body(int(geom.bodyid[0])).name)
-        owner.add_site(name=name, pos=geom.pos, quat=geom.quat)
-        # A ray goes along z: this one is turned downwards, state by state.
-        owner.add_site(name=f"{name}/down", pos=geom.pos)
-        site, joint = objects.mjOBJ_SITE, objects.mjOBJ_JOINT
-        frames = ("framepos", "framexaxis", "frameyaxis", "framezaxis", "framelinvel")
-        for kind in ("gyro", "accelerometer", "velocimeter", *frames):
-            what = getattr(kinds, f"mjSENS_{kind.upper()}")
-            spec.add_sensor(name=f"{name} {kind}", type=what, objtype=site, objname=name)
-        what, at = kinds.mjSENS_RANGEFINDER, f"{name}/down"
-        distance = [1, 0, 0]  # of what a ray may tell
-        spec.add_sensor(
-            name=f"{name} rangefinder", type=what, objtype=site, objname=at, intprm=distance
-        )
-        if module.kind.hinge is not None:
-            at = model.joint(int(model.body(name).jntadr[0])).name
-            for kind, what in (
-                ("jointpos", kinds.mjSENS_JOINTPOS),
-                ("jointvel", kinds.mjSENS_JOINTVEL),
-                ("jointactuatorfrc", kinds.mjSENS_JOINTACTFRC),
-            ):
-                spec.add_sensor(name=f"{name} {kind}", type=what, objtype=joint, objname=at)
-    model = spec.compile()
-    model.geom_rgba[[model.geom(k).name != "bed" for k in range(model.ngeom)], 3] = 0  # no ray
-    data, found = mujoco.MjData(model), {}
-    for lane in range(LANES):
-        data.qpos[:], data.qvel[:] = after[0][:, lane], after[1][:, lane]
-        data.ctrl[list(robot.servos)] = ctrl[:, lane]
-        mujoco.mj_kinematics(model, data)
-        for name in names:
-            site, quat = model.site(f"{name}/down"), np.zeros(4)
-            down = data.xmat[int(site.bodyid[0])].reshape(3, 3).T @ (0, 0, -1)
-            mujoco.mju_quatZ2Vec(quat, down)
-            model.site_quat[site.id], model.site_sameframe[site.id] = quat, 0
-        mujoco.mj_forward(model, data)
-        data.qacc[:] = qacc[:, lane]
-        mujoco.mj_rnePostConstraint(model, data)
-        mujoco.mj_sensorAcc(model, data)
-        for k in range(model.nsensor):
-            name, kind = model.sensor(k).name.rsplit(" ", 1)
-            found.setdefault((name, kind), []).append(data.sensor(k).data.copy())
-    return {key: np.array(rows) for key, rows in found.items()}
+    cues = EpisodeContext(target=tuple(TARGET))
+    return sensed(engine_of, SEA, after, ctrl, signals, cues, before)
 
 
 def expected(sensors, name):
@@ -187,7 +120,7 @@ def spiders(robot):
     ctrl = after[0][7:] + np.random.default_rng(0).uniform(-0.03, 0.03, (8, LANES))
     bricks = [m.name for m in robot.morphology.modules if m.type == "FixedBrick"]
     names = dict.fromkeys((*FEET, *bricks, "left_knee"))
-    return before, after, ctrl, mujocos(robot, names, after, qacc, ctrl)
+    return before, after, ctrl, mujoco_sensors(robot, names, after, qacc, ctrl)
 
 
 @pytest.mark.parametrize("kind", ["population", pytest.param("mjx", marks=pytest.mark.slow)])
@@ -223,15 +156,8 @@ def test_in_a_batch_of_different_bodies_they_feel_the_same(robot, spiders):
     before, after, ctrl, sensors = spiders
     robots = [robot, elbow_robot(SEA)]
     capacity = fit_capacity([*robots, arm_robot(SEA)], sites=("FixedBrick", "Fin"))
-    bodies = pack_bodies(robots, capacity, np.float64)
-
-    def engine():
-        return PopulationEngine(
-            make_batched_trees(SEA, capacity, bodies, LANES),
-            jax.tree.map(jnp.asarray, bodies.plant),
-        )
-
     signals = ("forces", "load", "each FixedBrick", "each Fin")
+    engine = lambda: batch_engine(robots, capacity, LANES)  # noqa: E731
     found, source = felt(engine, before, after, ctrl, signals)
     bricks = found.modules["each FixedBrick"]
     compare_bricks(bricks, source, sensors, [0])
@@ -379,15 +305,6 @@ def test_types_of_modules_bring_their_sensors(tmp_path):
     (tmp_path / "modules.yaml").write_text(FISHY.replace("type: gyro", "type: angle"))
     with pytest.raises(InputError, match=r"sensors.1: expected a kind that may sit on modules"):
         load_modules(tmp_path / "modules.yaml")
-
-
-PADDLE = """
-body:
-  type: Core
-  children:
-    1: {type: ActiveHinge, children: {1: {type: FixedBrick, children: {1: {type: ActiveHinge}}}}}
-    2: {type: FixedBrick}
-"""
 
 
 def test_a_runs_fingerprint_knows_the_sensors_of_types(tmp_path):

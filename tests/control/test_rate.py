@@ -24,14 +24,12 @@ def plant():
     return plant_of(elbow_robot(world()))
 
 
-def commands(plant, times, dt=0.005, make=None, **settings):
+def commands(plant, times, dt, **settings):
     """`[T, n, 3]` ctrl at times `[T]` or `[T, 3]`, in float64, at a timestep; held, unless told."""
     settings = {"between": "hold"} | settings
     plant = replace(plant, timestep=dt)
-    if make is None:
-        make = lambda plant: find_controller(plant, ControllerConfig(**settings))  # noqa: E731
     with jax.enable_x64(True):
-        controller = make(plant)
+        controller = find_controller(plant, ControllerConfig(**settings))
         parameters = controller.decode(jnp.asarray(GENES[: controller.num_genes]), plant)
         step = lambda state, t: controller.step(parameters, state, t, BLIND)  # noqa: E731
         run = jax.jit(lambda x: jax.lax.scan(step, controller.init(parameters), x)[1])

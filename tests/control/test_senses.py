@@ -8,7 +8,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import QUICK, WATER, arm_robot, box_robot, elbow_robot, random_states, world
+from laboratory import (
+    QUICK,
+    WATER,
+    arm_robot,
+    batch_engine,
+    box_robot,
+    elbow_robot,
+    random_states,
+    sensed,
+    world,
+)
 from mjx_revolve.control.courses import Course
 from mjx_revolve.control.readings import (
     OPTIONAL_SIGNALS,
@@ -17,11 +27,10 @@ from mjx_revolve.control.readings import (
     read_sensors,
     update_memory,
 )
-from mjx_revolve.engine.batch import fit_capacity, pack_bodies
-from mjx_revolve.engine.batched_trees import make_batched_trees
+from mjx_revolve.engine.batch import fit_capacity
 from mjx_revolve.engine.engines import make_engine
-from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.water.flow import water_of
+from references import mujoco_sensors
 
 LANES = 3
 TANK = world(**WATER | {"current": (0.3, 0.0, 0.0), "bed": {"height": -9.0}})
@@ -30,25 +39,9 @@ CUES = EpisodeContext(
 )
 
 
-def senses(tank, make, qpos, qvel, ctrl, time=2.0, cues=CUES, water=None):
-    """What is felt in float64 of robots that were told `ctrl`, as NumPy."""
-    with jax.enable_x64(True):
-
-        def run(qpos, qvel, ctrl):
-            engine = make()
-            state = engine.init(qpos, qvel)
-            memory = init_memory(OPTIONAL_SIGNALS, engine, state)
-            asked = engine.plant.arrange(ctrl)
-            memory = memory._replace(ctrl=asked)
-            now = water_of(tank) if water is None else water
-            felt = read_sensors(
-                tank, engine, state, now, jnp.asarray(time), cues, memory, OPTIONAL_SIGNALS
-            )
-            return felt._replace(noise=None), engine.plant.source
-
-        arrays = [jnp.asarray(x, jnp.float64) for x in (qpos, qvel, ctrl)]
-        found, source = jax.jit(run, compiler_options=QUICK)(*arrays)
-        return jax.tree.map(np.asarray, found), np.asarray(source)
+def senses(make, qpos, qvel, ctrl):
+    """What is felt of robots that were told `ctrl`."""
+    return sensed(make, TANK, (qpos, qvel), ctrl, OPTIONAL_SIGNALS, CUES, time=2.0)
 
 
 def own_order(rows, source, count):
@@ -76,50 +69,32 @@ def states(robot):
 @pytest.fixture(scope="module")
 def felt(robot, states):
     """Of one body, by its own step."""
-    return senses(TANK, lambda: make_engine(robot), *states)
+    return senses(lambda: make_engine(robot), *states)
 
 
 @pytest.fixture(scope="module")
-def mujocos(robot, states):
-    """The same states' sensordata, by the sensors' names, `[dim, lanes]` each."""
-    spec, kinds = robot.mj_spec.copy(), mujoco.mjtSensor
-    site = spec.body(robot.mj_model.body(1).name).add_site(name="core")
-    assert np.all(site.pos == 0)
-    of_core = {"gyro": kinds.mjSENS_GYRO, "velocity": kinds.mjSENS_VELOCIMETER}
-    for name, kind in of_core.items():
-        site_kind = mujoco.mjtObj.mjOBJ_SITE
-        spec.add_sensor(name=name, type=kind, objtype=site_kind, objname="core")
-    for k in range(1, robot.mj_model.njnt):
-        joint = robot.mj_model.joint(k).name
-        for name, kind in (
-            ("angle", kinds.mjSENS_JOINTPOS),
-            ("speed", kinds.mjSENS_JOINTVEL),
-            ("load", kinds.mjSENS_JOINTACTFRC),
-        ):
-            joint_kind = mujoco.mjtObj.mjOBJ_JOINT
-            spec.add_sensor(name=f"{name}{k}", type=kind, objtype=joint_kind, objname=joint)
-    model = spec.compile()
-    data, rows = mujoco.MjData(model), []
-    for lane in range(LANES):
-        data.qpos[:], data.qvel[:] = states[0][:, lane], states[1][:, lane]
-        data.ctrl[list(robot.servos)] = states[2][:, lane]
-        mujoco.mj_forward(model, data)
-        found = {model.sensor(k).name: data.sensor(k).data.copy() for k in range(model.nsensor)}
-        found["axes"] = data.body(1).xmat.copy()
-        rows.append(found)
-    return {name: np.stack([row[name] for row in rows], -1) for name in rows[0]}
+def hinges(robot):
+    return [robot.morphology.modules[k].name for k in robot.morphology.hinges]
+
+
+@pytest.fixture(scope="module")
+def mujocos(robot, states, hinges):
+    """What MuJoCo's sensors say of the same states, `[dim, lanes]` by (module, kind)."""
+    qpos, qvel, ctrl = states
+    found = mujoco_sensors(robot, ["core", *hinges], (qpos, qvel), 0 * qvel, ctrl)
+    return {key: rows.T for key, rows in found.items()}
 
 
 @pytest.mark.slow
 def test_the_core_feels_what_mujocos_sensors_do(felt, mujocos, states):
     sense, _ = felt
-    axes = mujocos["axes"].reshape(3, 3, LANES)
+    axes = np.stack([mujocos["core", f"frame{x}axis"] for x in "xyz"], 1)  # world from core
     assert np.stack(sense.up) == pytest.approx(axes[2], abs=1e-12)
     assert np.stack(sense.north) == pytest.approx(axes[0], abs=1e-12)
-    assert np.stack(sense.angular_velocity) == pytest.approx(mujocos["gyro"], abs=1e-12)
+    assert np.stack(sense.angular_velocity) == pytest.approx(mujocos["core", "gyro"], abs=1e-12)
     # Water that flows with .3 m/s along x, less the core's own velocity.
     water = np.einsum("ijl,i->jl", axes, (0.3, 0.0, 0.0))
-    assert np.stack(sense.flow) == pytest.approx(water - mujocos["velocity"], abs=1e-12)
+    assert np.stack(sense.flow) == pytest.approx(water - mujocos["core", "velocimeter"], abs=1e-12)
     assert sense.height == pytest.approx(states[0][2])
     assert sense.altitude == pytest.approx(states[0][2] + 9.0)
     # After 2 s the target is at (2, 2, -4).
@@ -134,19 +109,13 @@ def test_the_core_feels_what_mujocos_sensors_do(felt, mujocos, states):
     assert not sense.work.any()
 
 
-def test_joints_feel_what_mujocos_sensors_do(robot, felt, mujocos):
+def test_joints_feel_what_mujocos_sensors_do(hinges, felt, mujocos):
     sense, source = felt
-    for name in ("angle", "speed", "load"):
-        expected = np.concatenate([mujocos[f"{name}{k}"] for k in range(1, robot.num_hinges + 1)])
-        found = own_order(getattr(sense, name), source, robot.num_hinges)
+    for name, kind in (("angle", "pos"), ("speed", "vel"), ("load", "actuatorfrc")):
+        expected = np.concatenate([mujocos[hinge, f"joint{kind}"] for hinge in hinges])
+        found = own_order(getattr(sense, name), source, len(hinges))
         assert found == pytest.approx(expected, abs=1e-9), name
         assert np.abs(expected).max() > 0.01
-
-
-def of_many(robots, capacity):
-    bodies = pack_bodies(robots, capacity, np.float64)
-    rows = make_batched_trees(TANK, capacity, bodies, LANES)
-    return PopulationEngine(rows, jax.tree.map(jnp.asarray, bodies.plant))
 
 
 @pytest.mark.slow
@@ -154,11 +123,11 @@ def of_many(robots, capacity):
 @pytest.mark.parametrize("kind", ["different", "mjx", "alike"])
 def test_one_body_many_bodies_and_mjx_feel_the_same(kind, robot, felt, states):
     if kind == "mjx":
-        found, source = senses(TANK, partial(make_engine, robot, "mjx"), *states)
+        found, source = senses(partial(make_engine, robot, "mjx"), *states)
     else:
         robots = [robot] if kind == "alike" else [robot, robot, elbow_robot(TANK)]
         capacity = fit_capacity([*robots, elbow_robot(TANK)])
-        found, source = senses(TANK, lambda: of_many(robots, capacity), *states)
+        found, source = senses(lambda: batch_engine(robots, capacity, LANES), *states)
     lanes = slice(0, 2 if kind == "different" else LANES)
     one, own = felt
     for name in one._fields:
@@ -212,7 +181,7 @@ def test_touch_is_the_beds_force_on_each_body(robot):
     qpos[7:] = 0
     qpos[2] = -8.0, -8.98, -8.99
     ctrl = np.zeros((robot.num_hinges, LANES))
-    found, _ = senses(TANK, lambda: make_engine(robot), qpos, qvel, ctrl)
+    found, _ = senses(lambda: make_engine(robot), qpos, qvel, ctrl)
     assert found.touch.shape == (1 + robot.num_hinges, LANES)
     assert not found.touch[:, 0].any() and np.sum(found.touch[:, 2] > 0) > 1
     # The core's four lower corners are 2.5 mm deep in a bed of 3 kN/m; nothing else reaches it.

@@ -16,16 +16,15 @@ from mjx_revolve.inputs.errors import InputError
 DT = 0.01
 
 
-def watch(sensor, signal, noise=None, joint=None, dt=DT):
+def watch(sensor, signal, noise=None):
     """`[T, ...]` of what one sensor gives while the core's height follows a signal `[T, lanes]`."""
-    observer = make_observer([sensor], dt)
-    joint = np.zeros((1, 1), np.int32) if joint is None else joint
+    observer, joint = make_observer([sensor], DT), np.zeros((1, 1), np.int32)
 
     def step(state, now):
         k, height = now
         angle = jnp.broadcast_to(height, (joint.shape[0], *height.shape))
         sense = SensorReadings(height, height, (), (), angle=angle, noise=noise)
-        state, found = observer.observe(state, k * dt, sense, joint)
+        state, found = observer.observe(state, k * DT, sense, joint)
         return state, jnp.stack([*found.robot, *found.joint])
 
     with jax.enable_x64(True):

@@ -1,14 +1,12 @@
 """Brains that listen, and splines: what all of them promise, and each by hand."""
 
-from functools import lru_cache
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from laboratory import body, check_slope_at_rest, elbow_robot, world
+from laboratory import check_slope_at_rest, dry_robot, elbow_robot, play, world
 from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.control.gait import describe_gait
 from mjx_revolve.control.joint_network import make_joint_network
@@ -17,17 +15,11 @@ from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.control.sensory_cpg import make_sensory_cpg
 from mjx_revolve.control.splines import make_splines
 from mjx_revolve.engine.plant import plant_of
-from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.config import ControllerConfig
 
 DT, REACH = 0.005, np.pi / 4
 SENSORS = tuple(Sensor(type=name) for name in ("gyro", "depth", "angle", "speed", "contact"))
 KINDS = ("cpg", "sine", "mlp", "rnn", "sensory_cpg", "splines")
-
-
-@lru_cache
-def robot_of(name):
-    return build_robot(body(name), world())
 
 
 def make(kind, plant, **settings):
@@ -38,28 +30,16 @@ def make(kind, plant, **settings):
     return find_controller(plant, ControllerConfig(type=kind, **settings))
 
 
-def sense_of(rows, lanes=1, seed=0, order=None):
-    """Anything, `[lanes]`, in the rows' order."""
-    draw = np.random.default_rng(seed).normal
-    one, three = draw(size=lanes), tuple(draw(size=(3, lanes)))
-    angle, speed, touch = (np.abs(draw(size=(n, lanes))) for n in (rows, rows, 1 + rows))
-    if order is not None:
-        angle, speed = angle[order], speed[order]
-        touch = np.concatenate([touch[:1], touch[1:][order]])
+def sense_of(rows):
+    """Anything, of one lane."""
+    draw = np.random.default_rng(0).normal
+    one, three = draw(size=1), tuple(draw(size=(3, 1)))
+    angle, speed, touch = (np.abs(draw(size=(n, 1))) for n in (rows, rows, 1 + rows))
     return SensorReadings(one, one, three, three, angle=angle, speed=speed, touch=touch)
 
 
-def play(controller, plant, genes, steps, sense, start=0):
-    """`[steps, n, lanes]` targets, in float64."""
-    with jax.enable_x64(True):
-        sense = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), sense)
-        parameters = controller.decode(jnp.asarray(genes, jnp.float64), plant)
-
-        def step(state, k):
-            return controller.step(parameters, state, (start + k) * DT, sense)
-
-        run = jax.jit(lambda: jax.lax.scan(step, controller.init(parameters), jnp.arange(steps)))
-        return np.asarray(run()[1])
+def targets(*given, start=0):
+    return play(*given, start)[0]
 
 
 def drawn(controller, lanes=1, seed=0, scale=1.0):
@@ -70,13 +50,13 @@ def drawn(controller, lanes=1, seed=0, scale=1.0):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["auv", "spider"])
 def test_zero_genes_keep_still_whatever_is_felt(kind, name):
-    robot = robot_of(name)
+    robot = dry_robot(name)
     plant = plant_of(robot)
     controller = make(kind, plant)
     sense = sense_of(robot.num_hinges)
-    found = play(controller, plant, np.zeros((controller.num_genes, 1)), 150, sense)
+    found = targets(controller, plant, np.zeros((controller.num_genes, 1)), 150, sense)
     assert not (found - np.asarray(plant.low + plant.high)[None] / 2).any()
-    busy = play(controller, plant, drawn(controller), 150, sense)
+    busy = targets(controller, plant, drawn(controller), 150, sense)
     assert np.abs(busy - found).max() > 1e-4  # a cpg's thrusters run at a constant command
     if kind not in ("splines", "sine"):  # which the servo clips
         assert np.all(busy <= np.asarray(plant.high) + 1e-9)
@@ -87,7 +67,7 @@ def test_zero_genes_keep_still_whatever_is_felt(kind, name):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_genes_have_names_of_their_own_and_places(kind):
-    controller = make(kind, plant_of(robot_of("spider")))
+    controller = make(kind, plant_of(dry_robot("spider")))
     assert len(set(controller.gene_names)) == controller.num_genes == len(set(controller.genes))
 
 
@@ -101,13 +81,13 @@ def test_gradients_are_finite_at_zero_genes(kind):
 
 @pytest.mark.parametrize("kind", ["mlp", "rnn"])
 def test_a_shared_network_fits_any_body(kind):
-    counts = {make(kind, plant_of(robot_of(n))).num_genes for n in ("spider", "snake", "centipede")}
-    assert len(counts) == 1
-    assert all(gene.place == "robot" for gene in make(kind, plant_of(robot_of("snake"))).genes)
+    plants = [plant_of(dry_robot(name)) for name in ("spider", "snake", "centipede")]
+    assert len({make(kind, plant).num_genes for plant in plants}) == 1
+    assert all(gene.place == "robot" for gene in make(kind, plant_of(dry_robot("snake"))).genes)
 
 
 def test_what_a_controller_asks_to_feel():
-    plant = plant_of(robot_of("spider"))
+    plant = plant_of(dry_robot("spider"))
     assert make("mlp", plant).signals == ("touch",)
     assert make("rnn", plant, sensors=None).signals == ()
 
@@ -140,7 +120,7 @@ def test_the_shared_network_by_hand(recurrent):
     sense = SensorReadings(
         np.array([0.3]), np.array([0.4]), (), (), angle=np.array([[0.5], [-0.2]])
     )
-    found = play(controller, plant, genes, 120, sense)[..., 0]
+    found = targets(controller, plant, genes, 120, sense)[..., 0]
     said, memory = np.zeros(2), np.zeros((2, 3))
     units = range(1, 4)
     for k in range(120):
@@ -167,7 +147,7 @@ def test_the_shared_network_by_hand(recurrent):
 @pytest.mark.slow
 def test_messages_travel_from_neighbour_to_neighbour():
     """A step per joint: the tail hears of what the head feels as many steps later."""
-    robot = robot_of("snake")
+    robot = dry_robot("snake")
     plant, n = plant_of(robot), robot.num_hinges
     pairs = {(int(i), int(j)) for i, j in zip(plant.first[:, 0], plant.second[:, 0], strict=True)}
     assert (0, 1) in pairs and (1, 2) in pairs and (0, 2) not in pairs
@@ -175,7 +155,7 @@ def test_messages_travel_from_neighbour_to_neighbour():
     genes = drawn(controller)
     calm = SensorReadings(0.0, 0.0, (), (), angle=np.zeros((n, 1)))
     moved = calm._replace(angle=np.eye(n)[:, :1])
-    a, b = (play(controller, plant, genes, 6, x, start=200) for x in (calm, moved))
+    a, b = (targets(controller, plant, genes, 6, x, start=200) for x in (calm, moved))
     heard = np.abs(a - b)[..., 0] > 1e-12
     assert heard[:, 0].all() and heard[0].sum() == 1
     assert heard[1, 1] and not heard[1, 2] and heard[2, 2] and not heard[2, 3]
@@ -193,7 +173,7 @@ def test_oscillators_settle_at_their_lags_and_answer_to_sensors():
     genes[names.index(f"amplitude {second}")] = 0.3
     genes[names.index(f"lag {first}~{second}")] = 0.25
     quiet = SensorReadings(np.zeros(1), np.zeros(1), (), ())
-    found = play(controller, plant, genes, 1600, quiet)[..., 0]
+    found = targets(controller, plant, genes, 1600, quiet)[..., 0]
     time, rate = DT * np.arange(1600), 2 * np.pi * 1.0
     late = found[1200:]
     wave = np.exp(-1j * rate * time[1200:]) @ late / 200
@@ -215,7 +195,7 @@ def test_oscillators_settle_at_their_lags_and_answer_to_sensors():
         changed[names.index(f"lag {first}~{second}")] = 0.0
         changed[names.index(f"{gene} {first}")] = np.pi / 2
         felt = quiet._replace(climb=np.full(1, 0.5))
-        return play(controller, plant, changed, 1600, felt)[1200:, 0, 0] / REACH
+        return targets(controller, plant, changed, 1600, felt)[1200:, 0, 0] / REACH
 
     assert answer("offset climb").mean() == pytest.approx(0.5 * (1 - np.sin(0.6) ** 2 / 2), rel=0.2)
     assert np.abs(answer("amplitude climb")).max() == pytest.approx(1.0, rel=0.01)
@@ -231,7 +211,7 @@ def test_splines_go_through_their_points():
         controller = make_splines(plant, points, max_frequency=2.0)
         genes = drawn(controller, seed=points, scale=0.4)
         genes[-1] = 0.0  # 1 Hz
-        found = play(controller, plant, genes, 400, sense_of(2), start=200)[..., 0]
+        found = targets(controller, plant, genes, 400, sense_of(2), start=200)[..., 0]
         through = np.sin(genes[:-1, 0]).reshape(points, 2)
         curve = CubicSpline(
             np.arange(points + 1) / points, [*through, through[0]], bc_type="periodic"

@@ -62,7 +62,7 @@ def crowd(seed: int, spread: float = 0.05):
 
 
 @lru_cache(maxsize=4)
-def meeting_of(worlds: int = 1, tag: bool = False):
+def meeting_of(worlds: int = 1):
     """(qpos, qvel, present) → frames and meeting of the crowd."""
     space, robots, capacity, *packed = crowd_tables()
 
@@ -70,8 +70,7 @@ def meeting_of(worlds: int = 1, tag: bool = False):
     def find(packed, qpos, qvel, present):
         tables, spheres = packed
         rows = make_batched_trees(space, capacity, tables, len(robots))
-        labels = jnp.arange(len(robots), dtype=qpos.dtype) if tag else None
-        meet = make_interaction(rows, spheres, present, worlds, ContactParameters(), labels)
+        meet = make_interaction(rows, spheres, present, worlds, ContactParameters())
         state = PopulationEngine(rows, tables.plant).init(qpos, qvel)
         return frames_of(rows, state), meet.detect(state, meet.init(state))[0]
 

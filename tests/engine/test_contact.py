@@ -11,7 +11,7 @@ from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.simulate import simulate
 from mjx_revolve.water.bed import Bed, bed_height, bed_slope
 from mjx_revolve.water.world import load_world
-from references import Lagrangian, clearance
+from references import Lagrangian, clearance, each_lane
 
 RHO, G = 999.1026, 9.81
 LAKE = load_world("lake").bed
@@ -127,10 +127,8 @@ def test_a_core_lands_on_a_flat_bed_and_stays():
     # No bounce, tumble or shove ever adds to what it came with.
     lagrangian, net = Lagrangian(robot, RHO), (0.09 - RHO * 5.054e-5) * G
     for lane in range(8):
-        energy = [
-            lagrangian.energy(a, b) + net * a[2]
-            for a, b in zip(q[:, :, lane], v[:, :, lane], strict=True)
-        ]
+        energy = each_lane(lagrangian.energy, q[:, :, lane].T, v[:, :, lane].T)
+        energy += net * q[:, 2, lane]
         start = lagrangian.energy(qpos[:, lane], qvel[:, lane]) + net * qpos[2, lane]
         assert max(energy) < start
         # What rises is what the ground had stored.

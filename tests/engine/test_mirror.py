@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import QUICK, ROOT
-from mjx_revolve import build_robot, load_morphology, load_world
+from laboratory import QUICK, body
+from mjx_revolve import build_robot, load_world
 from mjx_revolve.engine.plant import actuators_of
 from mjx_revolve.engine.population import make_population_engine
 from mjx_revolve.numerics.xla import fuse
@@ -21,9 +21,7 @@ ROUNDING = 1e-12
 
 @lru_cache(maxsize=8)
 def load(name, **world):
-    return build_robot(
-        load_morphology(ROOT / "morphologies" / f"{name}.yaml"), load_world("lake", **world)
-    )
+    return build_robot(body(name), load_world("lake", **world))
 
 
 class Mirror:

@@ -13,14 +13,13 @@ import pytest
 from experiments.random_bodies import random_body
 from experiments.self_contact import make_march, random_gaits
 from experiments.water_tank import EMPTY, march
-from laboratory import QUICK, at_rest, body, limp, need_mjx
+from laboratory import QUICK, at_rest, batch_engine, body, limp, need_mjx
 from mjx_revolve import load_world
 from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
-from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.kinematics import body_poses
-from mjx_revolve.engine.population import PopulationEngine, make_population_engine
+from mjx_revolve.engine.population import make_population_engine
 from mjx_revolve.engine.robot import build_robot, check_timestep
 from mjx_revolve.engine.self_overlap import self_overlap
 from mjx_revolve.engine.self_pairs import candidate_pairs, part_gaps
@@ -259,20 +258,15 @@ def test_different_bodies_feel_themselves_and_others_as_one_alone_does():
     robot = jaw(**EMPTY)
     robots = [robot, build_robot(body("spider"), robot.world), robot]
     capacity = fit_capacity(robots)
-    bodies = pack_bodies(robots, capacity, np.float64)
     qpos, ctrl = np.zeros((7 + capacity.hinges, 3)), np.zeros((capacity.hinges, 3))
     qpos[:, 1] = at_rest(robots[1], 1, -2.0)[0][: len(qpos), 0]
     qpos[:9, [0, 2]], ctrl[:2, [0, 2]] = two_jaws(robot), INWARDS
     alone = feel(lambda: make_engine(robot), qpos[:9, [0, 2]], ctrl[:2, [0, 2]], (), 100)
-    hinge = np.asarray(bodies.plant.source[: capacity.rows])
+    hinge = np.asarray(pack_bodies(robots, capacity).plant.source[: capacity.rows])
     push = (np.zeros((1, 3)), np.zeros((1, 3)), np.full((1, 3), -4.0))
     aside = (0.0 * hinge[:, None], 3.0 * (hinge == 1)[:, None], 0.0 * hinge[:, None])
     wrench = ((push, push), (aside, aside))
-
-    def many():
-        plant = jax.tree.map(jnp.asarray, bodies.plant)
-        return PopulationEngine(make_batched_trees(robot.world, capacity, bodies, 3), plant)
-
+    many = lambda: batch_engine(robots, capacity, 3)  # noqa: E731
     _, _, touch, _, pushed = feel(many, qpos, ctrl, wrench, 100)
     assert not touch[:, 1].any()
     for lane, own in ((0, 0), (2, 1)):
@@ -283,11 +277,19 @@ def test_different_bodies_feel_themselves_and_others_as_one_alone_does():
         assert (pushed - touch)[1:, lane] == pytest.approx(3.0 * (hinge[:, lane] == 1), abs=1e-9)
 
 
-def march_batch(robots, capacity, lanes, ctrl, steps):
-    """`[steps, nq, robots * lanes]` of different bodies side by side, in float64."""
-    run = jax.jit(make_march(robots[0].world, capacity, steps))
+def gaits(robots, capacity, steps):
+    """Four random ones of each robot, side by side."""
+    ctrl = np.zeros((steps, capacity.hinges, 4 * len(robots)))
+    for k, robot in enumerate(robots):
+        ctrl[:, : robot.num_hinges, 4 * k : 4 * k + 4] = random_gaits(robot, 4, steps, k)
+    return ctrl
+
+
+def march_batch(robots, capacity, ctrl):
+    """`[steps, nq, robots * 4]` of different bodies side by side, in float64."""
+    run = jax.jit(make_march(robots[0].world, capacity, len(ctrl)))
     with jax.enable_x64(True):
-        bodies = pack_bodies([r for r in robots for _ in range(lanes)], capacity, np.float64)
+        bodies = pack_bodies([r for r in robots for _ in range(4)], capacity, np.float64)
         run = run.lower(bodies, jnp.asarray(ctrl)).compile(QUICK)
         return np.asarray(run(bodies, jnp.asarray(ctrl)))
 
@@ -320,12 +322,10 @@ def test_different_bodies_that_are_looked_at_all_at_once_feel_the_same(other_bac
     world, steps = water(timestep=0.02), 40
     robots = [build_robot(random_body(k, 4 + k % 9, 6), world) for k in range(100, 112)]
     capacity = fit_capacity(robots)
-    ctrl = np.zeros((steps, capacity.hinges, 4 * len(robots)))
-    for k, robot in enumerate(robots):
-        ctrl[:, : robot.num_hinges, 4 * k : 4 * k + 4] = random_gaits(robot, 4, steps, k)
-    usual = march_batch(robots, capacity, 4, ctrl, steps)
+    ctrl = gaits(robots, capacity, steps)
+    usual = march_batch(robots, capacity, ctrl)
     other_back_end()
-    found = march_batch(robots, capacity, 4, ctrl, steps)
+    found = march_batch(robots, capacity, ctrl)
     np.testing.assert_allclose(found[0], usual[0], atol=5e-4)  # 20 µm at the end of 4 cm
     for k, robot in enumerate(robots):
         own = found[:, : 7 + robot.num_hinges, 4 * k : 4 * k + 4]
@@ -441,13 +441,11 @@ def test_random_bodies_under_fast_random_gaits_hardly_overlap(timestep):
     robots = [r for r in robots if len(r.assembly.meeting_pairs)]
     assert len(robots) > 20
     capacity, steps = fit_capacity(robots), round(2.0 / timestep)
-    ctrl = np.zeros((steps, capacity.hinges, 4 * len(robots)))
-    for k, robot in enumerate(robots):
-        ctrl[:, : robot.num_hinges, 4 * k : 4 * k + 4] = random_gaits(robot, 4, steps, k)
+    ctrl = gaits(robots, capacity, steps)
     for k, number in enumerate(SWUNG, len(robots) - len(SWUNG)):
         gait = random_gaits(robots[k], 1, steps, number)
         ctrl[:, : robots[k].num_hinges, 4 * k : 4 * k + 4] = gait
-    found = march_batch(robots, capacity, 4, ctrl, steps)
+    found = march_batch(robots, capacity, ctrl)
     assert np.isfinite(found).all()
     deep = np.concatenate(
         [

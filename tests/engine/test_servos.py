@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from experiments.random_bodies import random_body
-from laboratory import body, elbow_robot, world
+from laboratory import batch_engine, body, elbow_robot, world
 from mjx_revolve.body.morphology import trim_neutral
 from mjx_revolve.engine.assembly import FULL_TORQUE_ERROR
-from mjx_revolve.engine.batch import fit_capacity, pack_bodies
-from mjx_revolve.engine.batched_trees import make_batched_trees
-from mjx_revolve.engine.population import PopulationEngine
+from mjx_revolve.engine.batch import fit_capacity
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.servos import servo
 from mjx_revolve.engine.single_tree import make_single_tree
@@ -101,11 +99,8 @@ def test_hinges_that_reverse_together_do_not_push_each_other_far_beyond_the_top_
         for s, n in kinds
     ]
     capacity = fit_capacity(robots, (), False, 0, 0, 0, ())
-    bodies = jax.tree.map(jnp.asarray, pack_bodies(robots, capacity))
-    engine = PopulationEngine(
-        make_batched_trees(waters, capacity, bodies, len(robots)), bodies.plant
-    )
-    low, high = bodies.plant.low, bodies.plant.high
+    engine = batch_engine(robots, capacity, len(robots), np.float32)
+    low, high = engine.plant.low, engine.plant.high
     start = np.zeros((7 + low.shape[0], len(robots)), np.float32)
     start[2], start[3] = -3, 1
     jumps = np.random.default_rng(3).integers(0, 2, (round(3 / dt), *low.shape)).astype(np.float32)
@@ -116,7 +111,7 @@ def test_hinges_that_reverse_together_do_not_push_each_other_far_beyond_the_top_
 
     begin = engine.init(jnp.asarray(start), jnp.zeros_like(start[1:]))
     speed = np.asarray(jax.jit(lambda x: jax.lax.scan(step, begin, x)[1])(jnp.asarray(jumps)))
-    there = np.asarray(bodies.plant.source)[: speed.shape[1]] < [r.num_hinges for r in robots]
+    there = np.asarray(engine.plant.source)[: speed.shape[1]] < [r.num_hinges for r in robots]
     ratio = np.where(there, np.abs(speed), 0) / 5.235988
     assert ratio.max() < 1.85
     assert np.quantile(ratio[:, there], 0.5) > 0.3  # they do move

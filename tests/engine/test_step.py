@@ -1,6 +1,6 @@
 """Whole steps with all laws at work: conserved, carried along, righted, differentiable."""
 
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import jax
 import jax.numpy as jnp
@@ -34,27 +34,11 @@ from mjx_revolve.water.added_mass import box_added_mass
 from mjx_revolve.water.bed import Bed
 from mjx_revolve.water.face_drag import FACES
 from mjx_revolve.water.flow import Water, gust_path
-from references import Lagrangian, rotation
+from references import Lagrangian, each_lane
 
 RHO, G = 999.1026, 9.81
 CUBE = (0.1, 0.1, 0.1)  # carries the same water along every axis, so no Munk moment turns it
 pytestmark = pytest.mark.usefixtures("quick_compiles")
-
-
-def impulse(lagrangian, qpos, qvel):
-    """Linear and angular impulse of body and water, the latter about the world's origin.
-
-    Momenta of the root's six coordinates are those of the whole, in the frames of its velocities.
-    """
-    momentum = lagrangian.inertia(qpos) @ qvel
-    turn = rotation(qpos[3:7] / np.linalg.norm(qpos[3:7]))
-    spin = turn @ momentum[3:6] + np.cross(qpos[:3], momentum[:3])
-    return np.concatenate([momentum[:3], spin])
-
-
-def _each(function, qpos, qvel):
-    """A function of one state, of every lane."""
-    return np.array([function(*state) for state in zip(qpos.T, qvel.T, strict=True)])
 
 
 @pytest.mark.slow
@@ -70,11 +54,11 @@ def test_a_limp_jointed_body_keeps_energy_and_impulse():
         qpos, qvel = random_states(robot, 8, speed=0.2)
         _, q, v, _ = march(robot, 1.0, qpos, qvel, every=round(0.1 / dt))
         lagrangian = Lagrangian(robot, RHO)
-        energies = [_each(lagrangian.energy, *s) for s in zip(q, v, strict=True)]
-        momenta = [_each(partial(impulse, lagrangian), *s) for s in zip(q, v, strict=True)]
-        first = _each(partial(impulse, lagrangian), qpos, qvel)
+        energies = [each_lane(lagrangian.energy, *s) for s in zip(q, v, strict=True)]
+        momenta = [each_lane(lagrangian.impulse, *s) for s in zip(q, v, strict=True)]
+        first = each_lane(lagrangian.impulse, qpos, qvel)
         scale = np.abs(first).max(1)
-        kept = [energy / _each(lagrangian.energy, qpos, qvel) - 1 for energy in energies]
+        kept = [energy / each_lane(lagrangian.energy, qpos, qvel) - 1 for energy in energies]
         moved = [np.abs(momentum - first).max(1) / scale for momentum in momenta]
         assert np.abs(kept).max() < 0.05
         assert np.max(moved) < 0.02
@@ -90,11 +74,10 @@ def test_servos_give_no_more_energy_than_they_deliver():
     ctrl = np.random.default_rng(1).uniform(-0.6, 0.6, (robot.num_hinges, 16))
     _, q, v, work = march(robot, 2.0, qpos, qvel, ctrl, every=20)
     lagrangian = Lagrangian(robot, RHO)
-    start = np.array([lagrangian.energy(*s) for s in zip(qpos.T, qvel.T, strict=True)])
-    for row, rate, done in zip(q, v, np.cumsum(work, 0), strict=True):
-        energy = [lagrangian.energy(*s) for s in zip(row.T, rate.T, strict=True)]
+    start = each_lane(lagrangian.energy, qpos, qvel)
+    for *state, done in zip(q, v, np.cumsum(work, 0), strict=True):
         # End stops and friction take some; the step errs by a few per cent.
-        assert np.all(energy < 1.02 * (start + done))
+        assert np.all(each_lane(lagrangian.energy, *state) < 1.02 * (start + done))
 
 
 def gusty(tank, seed, seconds):
@@ -202,20 +185,15 @@ def test_a_whole_rollout_does_not_know_how_fast_its_water_goes():
     assert other_work == pytest.approx(work, abs=1e-9)
 
 
-def closing(speed, drag, inertia, time):
-    """A body that quadratic drag takes along with the water: u - v = u / (1 + c u t / m)."""
-    return speed / (1 + drag * np.abs(speed) * time / inertia)
-
-
 @pytest.mark.parametrize("added_mass", [False, True])
 def test_a_body_drifts_to_the_current(added_mass):
-    """From rest, in three currents at once; 0.5 % of the current at 5 ms."""
+    """From rest, in three currents at once, u - v = u / (1 + c u t / m); 0.5 % of it at 5 ms."""
     current = np.array([0.3, -0.2, 0.1])
     robot = box_robot(CUBE, 1.0, world(drag="faces", added_mass=added_mass, current=current))
     time, _, v, _ = march(robot, 10.0, *at_rest(robot, 1, -5.0), every=20)
     inertia = 1.0 + (RHO * robot.fluid.added_mass[0, 0] if added_mass else 0.0)
     drag = face_drag(robot).linear[0, 0]
-    expected = current - closing(current, drag, inertia, time[:, None])
+    expected = current - current / (1 + drag * np.abs(current) * time[:, None] / inertia)
     assert v[:, :3, 0] == pytest.approx(expected, abs=0.005 * 0.3)
     assert np.linalg.norm(v[-1, :3, 0] - current) < 0.05
 

@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 import scipy.special
 
-from laboratory import at_rest, box_robot, march, read, world
+from laboratory import at_rest, batch_engine, box_robot, march, read, world
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import make_morphology
-from mjx_revolve.engine.batch import fit_capacity, pack_bodies
-from mjx_revolve.engine.batched_trees import make_batched_trees
-from mjx_revolve.engine.population import PopulationEngine
+from mjx_revolve.engine.batch import fit_capacity
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.numerics.spatial import dot
 from mjx_revolve.water.cross_flow import CROSS_FLOW
@@ -274,9 +272,7 @@ def test_both_engines_and_bodies_side_by_side_remember_alike():
         np.testing.assert_allclose(a, b, atol=1e-8)
     robots = [robot, box_robot(PLATE, 0.1, robot.world)]
     capacity = fit_capacity(robots)
-    packed = jax.tree.map(jnp.asarray, pack_bodies(robots, capacity, np.float64))
-    engine = PopulationEngine(make_batched_trees(robot.world, capacity, packed, 2), packed.plant)
-    wide = np.zeros((engine.tree.joints_to_tree.__self__.capacity.hinges, 2))
+    engine, wide = batch_engine(robots, capacity, 2), np.zeros((capacity.hinges, 2))
     start = engine.init(*(jnp.asarray(np.repeat(x, 2, 1)) for x in (qpos, qvel)))
     water = water_of(robot.world)
 
