@@ -5,6 +5,7 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from experiments import (
     bench,
@@ -18,6 +19,9 @@ from experiments import (
     validation,
     validation_cases,
 )
+from experiments import (
+    revolve2_comparison as comparison,
+)
 from experiments.falling_spider import (
     GAZEBO_GRAVITY,
     closed_form,
@@ -27,6 +31,10 @@ from experiments.falling_spider import (
     read_run,
 )
 from laboratory import ROOT, check_error
+from mjx_revolve import build_robot, load_world, make_cpg
+from mjx_revolve.engine.plant import plant_of
+from mjx_revolve.episodes.config import load_config
+from mjx_revolve.episodes.tasks import TASKS
 from mjx_revolve.inputs.commands import run_command
 
 THESIS = ROOT.parent / "shared" / "thesis"
@@ -193,3 +201,59 @@ def test_on_a_cpu_the_gpus_programs_run_without_our_annotations(tmp_path, monkey
     assert measured | missing == set(gpu.ENGINES)
     assert measured >= {"ours, no water", "ours, default water"}
     assert all(row["steps_per_second"] > 0 for row in numbers["rows"])
+
+
+@pytest.mark.parametrize("name", senses.CONFIGS)
+def test_cases_differ_in_what_they_feel_only(name):
+    cases = senses.make_cases(name, ["evolution.generations=7"])
+    found = {case: load_config(name, settings) for case, settings in cases.items()}
+    ours = found["closed"]
+    assert ours.controller == load_config(name).controller
+    assert set(found) - {"without"} == {"closed", *senses.OPEN}
+    for case, config in found.items():
+        assert config.task == ours.task and config.evolution == ours.evolution
+        assert config.evolution.generations == 7
+        assert config.world == ours.world and config.morphology == ours.morphology
+        if case in senses.OPEN:
+            assert config.controller.type == case and config.controller.sensors is None
+    if "without" in found:
+        kinds = {sensor.type for sensor in found["without"].controller.sensors}
+        taken = {sensor.type for sensor in ours.controller.sensors} - kinds
+        assert kinds and taken == set(senses.CONFIGS[name].settings)
+
+
+def test_all_tasks_that_need_senses_are_compared():
+    """All but those that are scored along a way that stays, as open loops can swim it."""
+    compared = {load_config(name).task.type for name in senses.CONFIGS}
+    assert compared == TASKS.keys() - {"directed_swim", "speed", "crawl"}
+
+
+def test_the_robots_are_made_of_revolve2s_modules():
+    gecko = comparison.load_bodies()[0]
+    # CoreV1, BrickV1 and ActiveHingeV1 state 0.25, 0.03 and 0.011 + 0.058 + 0.02 kg.
+    assert gecko.mass == pytest.approx(0.25 + 6 * 0.03 + 6 * 0.089)
+    hip = gecko.modules[gecko.hinges[0]]
+    # Half a core, then the hinge's joint 22.6 + 11.9 mm further.
+    anchor = hip.position + hip.rotation @ hip.kind.hinge.anchor
+    assert np.linalg.norm(anchor) == pytest.approx(0.0445 + 0.022625 + 0.0119)
+    heavier = comparison.load_bodies([{"mass": gecko.mass + 0.1}])
+    assert heavier[0].mass == pytest.approx(gecko.mass + 0.1)
+    assert heavier[0].num_modules == gecko.num_modules
+
+
+def test_the_matrix_is_that_of_our_cpg():
+    """Targets after k periods: middle + reach × tanh of the matrix exponential's x."""
+    body = comparison.load_bodies()[1]
+    [genes] = comparison.make_population([body], 1, seed=3)
+    matrix, n = comparison.cpg_matrix(body, genes), body.num_hinges
+    np.testing.assert_array_equal(matrix, -matrix.T)
+    plant = plant_of(build_robot(body, load_world("lake")))
+    cpg, dt = make_cpg(plant, comparison.FREQUENCY), plant.timestep
+    parameters = cpg.decode(jnp.asarray(genes[:, None], jnp.float32), plant)
+    state, x = cpg.init(parameters), np.repeat([0.0, 1.0], n)
+    reach = body.modules[body.hinges[0]].kind.hinge.range[1]
+    for k in range(1, 40):
+        state, targets = cpg.step(parameters, state, jnp.float32(k * dt), None)
+        x = expm(dt * matrix) @ x
+        expected = reach * np.tanh(x[:n])
+        np.testing.assert_allclose(np.ravel(targets), expected[plant.source[:n, 0]], atol=1e-4)

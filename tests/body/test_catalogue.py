@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import yaml
 
 from laboratory import check_refused, write
 from mjx_revolve.body.boxes import boxes_overlap, quarter_turn, union_measure
@@ -171,7 +170,6 @@ def test_edge_against_edge_needs_the_cross_products():
 
 PART = Part("p", (Box((1, 1, 1)),), 1.0, 1.0)
 HINGE = Hinge((0, 1, 0), (0, 0, 0), (-1, 1), 1.0, 1.0)
-LINE = Thruster(curve="interpolated", commands=(-1, 0, 1), thrusts=(-1, 0, 2))
 
 
 @pytest.mark.parametrize(
@@ -198,30 +196,15 @@ FIN = """
 modules:
   Fin:
     mount: -x
-    hinge:
-      axis: [0, 2, 0]
-      anchor: [.00465, 0, 0]
-      range: [-0.6, 0.6]
+    hinge: {axis: [0, 2, 0], anchor: [.00465, 0, 0], range: [-0.6, 0.6]}
     parts:
-      - name: holder
-        size: [.022, .036, .010]
-        mass: 2e-3
-      - name: blade
-        position: [.04, 0, 0]
-        boxes:
-          - size: [.06, .04, .002]
-          - {size: [.002, .04, .01], position: [.03, 0, 0]}
-        mass: .006
-        drag_coefficient: 1.9
-    slots:
-      1: +x
+      - {name: holder, size: [.022, .036, .010], mass: 2e-3}
+      - {name: blade, position: [.04, 0, 0], mass: .006, drag_coefficient: 1.9, boxes: [
+          {size: [.06, .04, .002]}, {size: [.002, .04, .01], position: [.03, 0, 0]}]}
+    slots: {1: +x}
   Ring:
     mount: {position: [0, -0.02, 0], outward: [0, 1, 0]}
-    parts:
-      - size: [.04, .04, .04]
-        mass: .01
-        volume: 3e-5
-        contact: false
+    parts: [{size: [.04, .04, .04], mass: .01, volume: 3e-5, contact: false}]
     slots:
       1: +y
       5: {position: [0, 0, .02], direction: [0, 0, 1], up: [0, -1, 0]}
@@ -255,13 +238,9 @@ def test_own_types_make_a_robot(tmp_path):
 body:
   type: Core
   children:
-    1:
-      type: Ring
-      children:
-        1: {type: Fin, orientation: 90, id: tail}
-        5: {type: FixedBrick, id: top}
-    2:
-      type: Hoop
+    1: {type: Ring, children: {
+      1: {type: Fin, orientation: 90, id: tail}, 5: {type: FixedBrick, id: top}}}
+    2: {type: Hoop}
 """
     morphology = load_morphology(write(tmp_path, robot), modules=mine)
     places = {m.name: m for m in morphology.modules}
@@ -287,34 +266,17 @@ def test_own_core_replaces_the_catalogues_under_all_its_names(tmp_path):
     assert load_morphology(robot, modules=mine).mass == 0.5
 
 
-def _changed(change) -> str:
-    data = yaml.safe_load(FIN)
-    change(data["modules"])
-    return yaml.safe_dump(data)
-
-
-def _set(*keys_and_value):
-    *keys, last, value = keys_and_value
-
-    def change(data):
-        for key in keys:
-            data = data[key]
-        data[last] = value
-
-    return change
-
-
 @pytest.mark.parametrize(
     "text, message",
     [
         ("", "mine.yaml: expected a mapping with modules; found None"),
         (
-            _changed(_set("Fin", "parts", 1, "size", [1, 1, 1])),
+            FIN.replace("name: blade,", "name: blade, size: [1, 1, 1],"),
             "modules.Fin.parts.1: expected one of size and boxes; found both or neither",
         ),
-        (_changed(_set("Fin", "mount", "-z")), "Fin.mount: expected -x, +x, -y, +y or a mapping"),
+        (FIN.replace("mount: -x", "mount: -z"), "Fin.mount: expected -x, +x, -y, +y or a mapping"),
         (
-            _changed(_set("Fin", "aliases", ["Hoop"])),
+            FIN.replace("mount: -x", "mount: -x\n    aliases: [Hoop]"),
             "modules.Ring: expected each name and alias once; found Hoop twice",
         ),
     ],

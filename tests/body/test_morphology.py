@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from laboratory import OURS, ROOT, body, check_refused, refusal, write
+from laboratory import OURS, ROOT, WILD, body, check_refused, refusal, write
 from mjx_revolve.body.catalogue import MODULES, THESIS_MODULES, LiftDrag
 from mjx_revolve.body.coefficients import read_morphology_files
 from mjx_revolve.body.exposure import exposure
@@ -25,15 +25,7 @@ from mjx_revolve.body.morphology import (
 )
 from mjx_revolve.inputs.errors import InputError
 
-WILD_FOLDER = ROOT.parent / "shared" / "revolve_robots"
 WATER = 999.1026  # kg/m³, the thesis's
-
-
-def wild(name: str) -> Path:
-    path = WILD_FOLDER / f"{name}.yaml"
-    if not path.exists():
-        pytest.skip("Revolve's own robots (../shared/revolve_robots) are not on this machine")
-    return path
 
 
 def read(folder: Path, text: str, **options) -> Morphology:
@@ -48,7 +40,12 @@ LEGS = {0: (0, -1, 0), 1: (0, 1, 0), 2: (1, 0, 0), 3: (-1, 0, 0)}
 
 @pytest.fixture(params=["ours", "Revolve's"])
 def spider(request) -> Morphology:
-    return body("spider") if request.param == "ours" else load_morphology(wild("spider"))
+    if request.param == "ours":
+        return body("spider")
+    for path in WILD:
+        if path.stem == "spider":
+            return load_morphology(path)
+    pytest.skip("Revolve's own robots (../shared/revolve_robots) are not on this machine")
 
 
 def leg(morphology: Morphology, slot: int) -> list:
@@ -141,7 +138,7 @@ def test_our_robots_load_save_and_have_colours_and_names(path, tmp_path):
     assert not any(m.name.startswith(m.type) for m in robot.modules)
 
 
-WILD = """---
+LOOSE = """---
 id: 7
 body:
   id: 1
@@ -166,7 +163,7 @@ brain: [neurons, 1e-3]
 
 
 def test_loose_spellings_are_understood(tmp_path, caplog):
-    robot = read(tmp_path, WILD)
+    robot = read(tmp_path, LOOSE)
     assert caplog.messages[0].endswith(
         ": ids that repeat, or that MuJoCo needs, are changed: Leg is now Leg_2, world is now "
         "world_2"
@@ -307,11 +304,8 @@ body:
     assert (core.buoyancy, core.drag, core.added_mass) == ("mask", "off", False)
     assert core.entrained_water == 0.5
     for part in hinge:
-        assert (part.drag, part.drag_coefficient, part.added_mass_coefficient) == (
-            "ellipsoid",
-            2,
-            3,
-        )
+        assert (part.drag, part.drag_coefficient) == ("ellipsoid", 2)
+        assert part.added_mass_coefficient == 3
     assert brick.lift_drag == LiftDrag(cla=2.0)
     assert fin.lift_drag == replace(MODULES["Fin"].parts[0].lift_drag, cla=2.0)
     assert fin.drag == "faces"
@@ -474,21 +468,9 @@ def test_random_trees_round_trip(seed, tmp_path):
 
 # A brick on each side of the core's front, and from one of them a chain that turns back into it.
 RING = """
-body:
-  type: Core
-  children:
-    1:
-      id: a
-      type: FixedBrick
-      children:
-        2:
-          id: b
-          type: FixedBrick
-          children:
-            2:
-              id: c
-              type: FixedBrick
-              children: {1: {id: d, type: FixedBrick}}
+body: {type: Core, children: {1: {id: a, type: FixedBrick, children: {
+  2: {id: b, type: FixedBrick, children: {
+    2: {id: c, type: FixedBrick, children: {1: {id: d, type: FixedBrick}}}}}}}}}
 """
 
 
@@ -725,3 +707,19 @@ def test_equality_sees_every_field(tmp_path):
         ("\nbody", "\nbrain: {}\nbody"),
     ]:
         assert robot != read(tmp_path, base.replace(old, new))
+
+
+# Modules and hinges, counted in revolve2-standards 1.2.4.
+STANDARD = {
+    "ant": (17, 8), "babya": (16, 8), "babyb": (21, 10), "blokky": (15, 5), "garrix": (15, 10),
+    "gecko": (13, 6), "insect": (12, 9), "linkin": (15, 12), "longleg": (15, 12), "park": (15, 8),
+    "penguin": (19, 12), "pentapod": (15, 10), "queen": (14, 9), "revolve_snake": (16, 8),
+    "salamander": (25, 14), "spider": (17, 8), "squarish": (13, 6), "stingray": (15, 9),
+    "tinlicker": (15, 8), "turtle": (20, 13), "ww": (15, 10), "zappa": (15, 11),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", STANDARD)
+def test_a_robot_of_revolve2_has_its_modules(name):
+    robot = body(name)
+    assert (robot.num_modules, robot.num_hinges) == STANDARD[name]

@@ -1,4 +1,4 @@
-"""Checked values: what they take, and every kind of complaint in one line."""
+"""Checked values: what they take, every kind of complaint in one line, what is printed of them."""
 
 import dataclasses
 import pickle
@@ -28,6 +28,7 @@ from mjx_revolve.inputs.schema import (
     read,
     words,
 )
+from mjx_revolve.inputs.short_repr import short_repr
 
 
 @checked
@@ -118,3 +119,19 @@ def test_complaints(values, message):
         assert message in found and "\n" not in found
         if name != "here":
             assert found.startswith(f"tree {given['name']!r}: ")
+
+
+@dataclasses.dataclass(repr=False)
+class Some:
+    name: str
+    rows: np.ndarray
+    more: object = None
+    hidden: int = dataclasses.field(default=3, repr=False)
+    __repr__ = short_repr
+
+
+def test_arrays_by_shape_and_nothing_by_nothing():
+    assert repr(Some("a", np.zeros((200, 3)))) == "Some(name='a', rows [200, 3])"
+    assert repr(Some("a", np.float64(2.0))) == "Some(name='a', rows=np.float64(2.0))"
+    inner = Some("b" * 500, np.zeros(2))
+    assert len(repr(Some("a", np.zeros(1), inner))) < 200
