@@ -309,12 +309,6 @@ def test_robots_that_float_or_are_too_light_do_not_hinder_others(tmp_path):
     assert "fish" not in names  # its tail is too light for the step
 
 
-@pytest.fixture(scope="module")
-def catalogue():
-    """Of a body and a configuration, with all shipped bodies: that takes seconds."""
-    return load_catalogue(["snake", "lake_swim"], "empty_underwater")
-
-
 def test_ctrl_c_ends_it(monkeypatch, capsys):
     # Tests in the background ignore it.
     heard = signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -347,8 +341,6 @@ def test_mistakes_end_in_one_line(capsys, argv, said):
     assert run_command(live.main, argv) == 2
     check_error(capsys.readouterr(), f"error: {said}")
 
-
-# --------------------------------------------------------------------- in a browser
 
 FACTS = "(document.documentElement?.dataset ?? {})"
 

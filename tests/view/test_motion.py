@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from mjx_revolve.episodes.config import TaskConfig
-from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.motion import (
     analyse_motion,
@@ -20,29 +19,17 @@ from mjx_revolve.view.motion import (
     stroke_period,
     stroke_rows,
 )
+from standin import PERIOD, SECONDS, TIME, swim, trajectory
 
-PERIOD, SPEED, SECONDS = 0.8, 0.05, 6.0
-TIME = np.arange(0.02, SECONDS + 1e-9, 0.02)
-HEADING = 0.6
-
-
-def episode(robot, time, qpos, **columns):
-    """A trajectory of a robot that is not told anything and needs no power."""
-    still = {"ctrl": np.zeros((len(time), robot.mj_model.nu)), "power": 0 * time}
-    return Trajectory(time, qpos, qvel=None, xpos=None, **still | columns)
+SPEED, HEADING = 0.05, 0.6
 
 
 @pytest.fixture(scope="module")
 def sine(elbow):
-    """Straight ahead at one speed and 2 W, hinges beating, 1.5 m deep, from the third second on."""
-    qpos = np.tile(elbow.mj_model.qpos0, (len(TIME), 1))
-    qpos[:, 0], qpos[:, 1] = SPEED * math.cos(HEADING) * TIME, SPEED * math.sin(HEADING) * TIME
-    qpos[:, 2] = -1.5
-    beat = 0.5 * np.sin(2 * np.pi * TIME / PERIOD)
-    qpos[:, 7:] = beat[:, None]
-    ctrl = qpos[:, 7:] + np.array([0.1, -0.2])
-    trajectory = episode(elbow, TIME, qpos, ctrl=ctrl, power=np.full(len(TIME), 2.0))
-    return analyse_motion(elbow, trajectory, counted_from=2.0)
+    """At one speed and 2 W, 1.5 m deep, targets off by so much, from the third second on."""
+    plain, power = swim(elbow, HEADING, 1.5), np.full(len(TIME), 2.0)
+    found = swim(elbow, HEADING, 1.5, ctrl=plain.qpos[:, 7:] + np.array([0.1, -0.2]), power=power)
+    return analyse_motion(elbow, found, counted_from=2.0)
 
 
 def test_how_fast_how_far_and_where_to(elbow, sine):
@@ -77,10 +64,10 @@ def test_rows_after_the_first_that_is_not_finite_are_left_out(elbow, sine):
     qpos = sine.qpos.copy()
     qpos[150] = np.nan
     assert count_finite(qpos) == 150
-    short = analyse_motion(elbow, episode(elbow, TIME, qpos))
+    short = analyse_motion(elbow, trajectory(elbow, TIME, qpos))
     assert {len(short.time), len(short.path), len(short.power), len(short.targets)} == {150}
     with pytest.raises(InputError, match="expected finite numbers in its first row; found none"):
-        analyse_motion(elbow, episode(elbow, TIME, np.nan * qpos))
+        analyse_motion(elbow, trajectory(elbow, TIME, np.nan * qpos))
 
 
 def test_a_task_counts_from_its_first_record():

@@ -34,22 +34,16 @@ STEP = 0.005
 SIZE = (160, 120)
 
 
-def swim(robot, seconds=1.0, velocity=(0.2, 0.1, 0.0), depth=1.0):
-    """The robot carried along at a constant velocity, flapping."""
-    time = STEP * np.arange(1, round(seconds / STEP) + 1)
-    qpos = np.tile(robot.start_qpos(depth), (len(time), 1))
-    qpos[:, :3] += time[:, None] * np.asarray(velocity)
-    qpos[:, 7:] = 0.4 * np.sin(2 * np.pi * time)[:, None]
-    nv, nu = robot.mj_model.nv, robot.mj_model.nu
-    zeros = [np.zeros((len(time), n)) for n in (nv, 3 * robot.mj_model.nbody, nu)]
-    trajectory = Trajectory(time, qpos, zeros[0], zeros[1].reshape(len(time), -1, 3), zeros[2],
-                            np.zeros(len(time)))  # fmt: skip
-    return Episode("spider: carried along", robot, trajectory)
-
-
 @pytest.fixture(scope="module")
 def episode(spider):
-    return swim(spider)
+    """A second in which it is carried along at a constant velocity, flapping."""
+    time, model = STEP * np.arange(1, 201), spider.mj_model
+    qpos = np.tile(spider.start_qpos(1.0), (200, 1))
+    qpos[:, :3] += np.outer(time, [0.2, 0.1, 0.0])
+    qpos[:, 7:] = 0.4 * np.sin(2 * np.pi * time)[:, None]
+    qvel, xpos, ctrl = (np.zeros((200, *n)) for n in ((model.nv,), (model.nbody, 3), (model.nu,)))
+    trajectory = Trajectory(time, qpos, qvel, xpos, ctrl, np.zeros(200))
+    return Episode("spider: carried along", spider, trajectory)
 
 
 @pytest.fixture(scope="module")
@@ -204,8 +198,7 @@ def test_frames_are_evenly_spaced_and_between_the_rows(episode):
     assert film.lost is None
 
 
-def test_a_trajectory_that_fails_is_shown_up_to_there(spider):
-    episode = swim(spider)
+def test_a_trajectory_that_fails_is_shown_up_to_there(episode):
     qpos = np.array(episode.trajectory.qpos)
     qpos[120:] = np.nan
     film = make_film(replace(episode, trajectory=replace(episode.trajectory, qpos=qpos)), SIZE, 30)

@@ -319,9 +319,6 @@ def test_the_command_gives_the_same_settings(copy):
     assert command.startswith("OPENBLAS_NUM_THREADS=2 XLA_FLAGS='--a --b' python -m ")
 
 
-# --- the page ---
-
-
 class Page(HTMLParser):
     """Words and images of a page, in which nothing comes from elsewhere."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 from dataclasses import replace
 
 import matplotlib.image
@@ -14,35 +13,13 @@ import pytest
 from laboratory import WATER, body, world
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.config import TaskConfig
-from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.plots import figure_png
 from mjx_revolve.view.swim_picture import plot_swim, pose_scenes
 from mjx_revolve.water.flow import Water
+from standin import TIME, swim, trajectory
 
-PERIOD, SPEED, SECONDS = 0.8, 0.05, 6.0
-TIME = np.arange(0.02, SECONDS + 1e-9, 0.02)
-
-
-def swim(robot, heading=0.0, depth=1.0, speed=SPEED):
-    """A robot that goes straight ahead at one speed while its hinges beat, without any physics."""
-    qpos = np.tile(robot.mj_model.qpos0, (len(TIME), 1))
-    qpos[:, 0] = speed * math.cos(heading) * TIME
-    qpos[:, 1] = speed * math.sin(heading) * TIME
-    qpos[:, 2] = -depth
-    beat = np.sin(2 * np.pi * TIME / PERIOD)
-    qpos[:, 7:] = 0.5 * beat[:, None]
-    return trajectory(robot, TIME, qpos)
-
-
-def trajectory(robot, time, qpos):
-    ctrl = np.zeros((len(time), robot.mj_model.nu))
-    return Trajectory(time, qpos, qvel=None, xpos=None, ctrl=ctrl, power=0 * time)
-
-
-def draw(robot, trajectory):
-    """`[900, 1600, 3]` the page, from 0 to 1."""
-    return matplotlib.image.imread(io.BytesIO(figure_png(plot_swim(robot, trajectory))))[..., :3]
+SPEED = 0.05
 
 
 def words(figure):
@@ -64,9 +41,6 @@ def small():
     return build_robot(body("core"), world(**WATER))
 
 
-# ------------------------------------------------------------------ what is shown
-
-
 def test_parts_stand_where_mujoco_has_them(elbow):
     """Boxes of the scene against MuJoCo's geoms, at a pose with every joint bent."""
     qpos = elbow.start_qpos()
@@ -83,9 +57,6 @@ def test_parts_stand_where_mujoco_has_them(elbow):
         # Of each box, MuJoCo's and the picture's, the eight corners coincide.
         away = np.abs(np.abs(local) - model.geom_size[k]).max(1)
         assert np.count_nonzero(away < 1e-6) >= 8, model.geom(k).name
-
-
-# ------------------------------------------------------------------ the page
 
 
 def test_the_page_says_how_fast_and_how_far(elbow):
@@ -125,7 +96,8 @@ def test_the_robot_is_inside_the_frame_whichever_way_it_swims(small):
     """Bright red: nothing else on the page is, so its pixels are the robot's."""
     modules = tuple(replace(m, rgb=(1.0, 0.0, 0.0)) for m in small.morphology.modules)
     red = build_robot(replace(small.morphology, modules=modules), small.world)
-    image = draw(red, swim(red, heading=2.0))
+    page = figure_png(plot_swim(red, swim(red, heading=2.0)))
+    image = matplotlib.image.imread(io.BytesIO(page))[..., :3]  # from 0 to 1
     hot = (image[..., 0] > 0.45) & (image[..., 1:].max(-1) < 0.3)
     rows, columns = np.nonzero(hot)
     assert len(rows) > 300
