@@ -2,12 +2,11 @@
 
 import pytest
 
-from laboratory import ROOT, check_refused
+from laboratory import check_refused
 from mjx_revolve.control.table import CONTROLLERS
 from mjx_revolve.episodes import config, tasks
 from mjx_revolve.episodes.config import dump_config, load_config, override_config
 
-CONFIGS = ROOT / "configs"
 GOOD = """
 morphology: robot.yaml
 world: lake
@@ -44,8 +43,6 @@ def test_defaults(folder):
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-("task.duration=abc", "--set task.duration: expected a number > 0 and <= 86400 [s]; found "
-         "'abc'"),
 ("task.settle=10", "task.settle: expected a time below task.duration (10 s); found 10"),
 ("task.type=swim", f"task.type: expected one of {', '.join(config.TASKS)}, or "
          "FILE.py:FUNCTION; found 'swim'"),
@@ -86,9 +83,7 @@ def test_defaults(folder):
          "high: 1}, b: {low: 0, high: 1}}}}", "bodies.selection.objectives: expected score, as"),
 ("task.durtion=5", "--set task.durtion: expected one of 32 keys; found an unknown key; "
          "did you mean task.duration?"),
-("wrld=lake", "found an unknown key; did you mean world?"),
 ("world={density: 1}", "expected a `name` (a world's name or path) beside the overrides"),
-("morphology=.", "--set morphology: expected a file; found a folder at"),
 ("task.duration", "--set task.duration: expected KEY.PATH=VALUE; found 'task.duration'"),
 ("task.type.deep.deeper=1", "--set task.type.deep.deeper: expected task.type to be a "
          "mapping; found 'directed_swim'")

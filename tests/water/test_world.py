@@ -22,18 +22,9 @@ from mjx_revolve.water.world import (
     make_world,
 )
 
-
-def fields(kind) -> str:
-    """Names of a dataclass's fields, as messages list them."""
-    return ", ".join(field.name for field in dataclasses.fields(kind))
-
-
-def count(kind) -> int:
-    return len(dataclasses.fields(kind))
-
-
 DOWN = "gravity: expected a number, or (0, 0, -g), since the surface is level [m/s2]; found"
 UNKNOWN = "found an unknown key; did you mean"
+KEYS = len(dataclasses.fields(LiftDrag))
 LAKE = load_world("lake").bed
 
 
@@ -139,24 +130,16 @@ def test_a_bed_by_its_height_alone_keeps_it(tmp_path):
 
 WRONG = [
     ({"density": math.nan}, "density: expected a number >= 0 [kg/m3]; found nan"),
-    ({"densty": 1000}, f"densty: expected one of {count(World)} keys; {UNKNOWN} density?"),
     ({"gravity": (1, 0, -9.8)}, f"{DOWN} (1, 0, -9.8)"),
-    ({"current": (0, "x", 0)}, "current.1: expected a number [m/s]; found 'x'"),
     ({"buoyancy": "half"}, "buoyancy: expected one of partial, mask, off; found 'half'"),
     ({"drag": "boxes"}, f"drag: expected {drag_names()}; found 'boxes'"),
     (
         {"bed": "sand"},
         "bed: expected 'off', a height in metres or a mapping with kind; found 'sand'",
     ),
-    ({"bed": {"kind": "hill"}}, "bed.kind: expected one of flat, lake; found 'hill'"),
     (
         {"lift_drag": {"cl": 1}},
-        f"lift_drag.cl: expected one of {count(LiftDrag)} keys; {UNKNOWN} lift_drag.cla?",
-    ),
-    (
-        {"shear": {"speed": 3}},
-        f"shear.speed: expected one of {fields(Shear)}; found an unknown key "
-        "(also wrong or missing: shear.velocity)",
+        f"lift_drag.cl: expected one of {KEYS} keys; {UNKNOWN} lift_drag.cla?",
     ),
     ({"gust": {"std": [1, -2, 0]}}, "gust.std.1: expected a number >= 0 [m/s]; found -2"),
     ({"waves": {"amplitude": 0.1}}, "waves.0: expected either wavelength or period; found none"),
@@ -189,7 +172,6 @@ def test_wrong_overrides(override, message):
         ("", "expected a mapping of world fields; found None"),
         ("1: 2", "1: expected the name of a setting; found a key that is no text"),
         ("name: 3", "name: expected a text; found 3"),
-        ("density: 1\ndensity: 2", "line 2: expected each key once; found 'density' twice"),
     ],
 )
 def test_wrong_files(tmp_path, text, message):
