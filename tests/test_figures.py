@@ -25,8 +25,8 @@ RESULTS = {
 }
 
 
-def fill(text, results=RESULTS):
-    return figures._MARK.sub(lambda mark: figures.fill_mark(mark, results), text)
+def fill(text):
+    return figures._MARK.sub(lambda mark: figures.fill_mark(mark, RESULTS), text)
 
 
 @pytest.mark.parametrize("page", figures.PAGES, ids=lambda page: page.name)

@@ -32,10 +32,9 @@ def read(given, *names):
     return {name: float(x[0]) for name, x in measure(given, names).items()}
 
 
-def swing(frequency, lags=(0.0, 0.7, 1.4), sizes=(0.4, 0.4, 0.4), time=TIME):
-    """`[S, n]` angles, each so many radians behind the first."""
-    waves = [a * np.sin(2 * np.pi * frequency * time + 0.2 - lag) for a, lag in zip(sizes, lags)]  # noqa: B905
-    return np.stack(waves, 1)
+def swing(frequency):
+    """`[S, 3]` angles, each 0.7 rad behind the one before."""
+    return 0.4 * np.sin(2 * np.pi * frequency * TIME[:, None] + 0.2 - 0.7 * np.arange(3))
 
 
 @pytest.mark.slow

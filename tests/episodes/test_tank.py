@@ -29,17 +29,13 @@ pytestmark = pytest.mark.usefixtures("quick_compiles")
 @pytest.fixture(scope="module")
 def mixed():
     settings = {
-        "morphology": "morphologies/spider.yaml",  # not used
+        "morphology": "spider",  # not used
         "trim": "neutral",
         "world": {"name": "lake", "bed": False, "timestep": 0.01},
         "controller": {"type": "mlp", "sensors": SENSORS, "hidden": 3, "messages": 1},
         "task": {"type": "speed", "duration": 2.0, "settle": 0.5, "trials": 1, "start_tilt": 0.0},
     }
-    with pytest.MonkeyPatch.context() as patch:
-        from laboratory import ROOT
-
-        patch.chdir(ROOT)
-        return make_mixed_fitness(settings, [read(OAR), read(ELBOW)])
+    return make_mixed_fitness(settings, [read(OAR), read(ELBOW)])
 
 
 @pytest.fixture(scope="module")

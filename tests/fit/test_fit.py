@@ -29,13 +29,7 @@ from mjx_revolve.fitting import (
     load_recording,
     make_noisy,
 )
-from mjx_revolve.fitting.estimate import (
-    correlation,
-    costs_of,
-    linearize,
-    middles,
-    normal_equations,
-)
+from mjx_revolve.fitting.estimate import correlation, costs_of, linearize, middles, normal_equations
 from mjx_revolve.fitting.identify import find_unknown, plan_motions
 from mjx_revolve.fitting.parameters import entries_of, read_free, with_values
 from mjx_revolve.fitting.problem import NOISE, make_problem
@@ -145,13 +139,19 @@ def test_what_changes_nothing_is_refused(auv):
         make_problem(auv, [recording], ["nose_suction"], FitSettings())
 
 
+def lying(start, z=-1.0):
+    """A second of a robot that does not move."""
+    time = np.arange(0, 1, 0.05)
+    pose = dict(x=0.0, y=0.0, z=z, qw=1.0, qx=0.0, qy=0.0, qz=0.0)
+    signals = {name: TimeSeries(time + start, x + 0 * time) for name, x in pose.items()}
+    return RobotRecording(str(start), signals)
+
+
 @pytest.mark.parametrize("factor", [2.0, 20.0])
 def test_a_robot_among_variants_moves_as_alone(factor):
     """Also where the drag is so large that the step's bounds grow."""
     robot = build_robot(load_morphology("core"), load_world("empty_underwater", timestep=0.02))
-    time = np.arange(0, 1, 0.05)
-    still = dict(x=0.0, y=0.0, z=-1.0, qw=1.0, qx=0.0, qy=0.0, qz=0.0)
-    given = [RobotRecording("a", {n: TimeSeries(time, x + 0 * time) for n, x in still.items()})]
+    given = [lying(0.0)]
 
     def track(robot, offset):
         problem = make_problem(robot, given, ["drag"], FitSettings(window=1.0, held_out=0.0))
@@ -166,12 +166,8 @@ def test_a_robot_among_variants_moves_as_alone(factor):
 def test_waves_are_where_they_were_when_the_recording_began():
     """Two that begin half a period apart are moved by opposite waves."""
     sea = load_world("empty_underwater", timestep=0.01, waves=[{"amplitude": 0.02, "period": 1.0}])
-    robot, time = build_robot(load_morphology("core"), sea), np.arange(0, 1, 0.05)
-    still = dict(x=0.0, y=0.0, z=-0.5, qw=1.0, qx=0.0, qy=0.0, qz=0.0)
-    given = [
-        RobotRecording(str(t), {n: TimeSeries(time + t, x + 0 * time) for n, x in still.items()})
-        for t in (0.0, 0.5, 1.0)
-    ]
+    robot = build_robot(load_morphology("core"), sea)
+    given = [lying(start, z=-0.5) for start in (0.0, 0.5, 1.0)]
     problem = make_problem(robot, given, ["drag"], FitSettings(window=1.0, held_out=0.0))
     rising = problem.simulate([problem.origin()])[0, :, 0, -1, 9]
     assert abs(rising[0] - rising[1]) > 0.01

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from laboratory import ROOT, WILD, refusal
+from laboratory import OURS, ROOT, WILD, refusal, tree
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import load_morphology, make_morphology, save_morphology
 from mjx_revolve.body.placement import find_overlaps
@@ -19,7 +19,7 @@ from mjx_revolve.genotypes.kinds import find_genotype
 from mjx_revolve.genotypes.table import GENOTYPES
 from mjx_revolve.inputs.errors import InputError
 
-ROBOTS = [*sorted((ROOT / "morphologies").glob("*.yaml")), *WILD]
+ROBOTS = [*OURS, *WILD]
 ALL = ("FixedBrick", "ActiveHinge", "TouchSensor", "Fin", "Thruster", "LiftThruster")
 SPACES = {
     "bricks and hinges": make_space(bodies_config.BodiesConfig(), MODULES),
@@ -67,12 +67,8 @@ def families():
 
 def places(body):
     """Type and turn of each module by its slots from the core."""
-    paths = [()]
-    for module in body.modules[1:]:
-        paths.append((*paths[module.parent], module.slot))
-    return {
-        path: (m.type, m.orientation % 360) for path, m in zip(paths, body.modules, strict=True)
-    }
+    core = ((), body.modules[0].type, body.modules[0].orientation)
+    return {path: (kind, turn % 360) for path, kind, turn in (core, *tree(body))}
 
 
 def distance(a, b):

@@ -72,25 +72,26 @@ SETTINGS = {
 GENES = jnp.array([[0.3, -0.7], [0.0, 0.0]])
 
 
+def fill(folder):
+    """A folder with a configuration that names own code."""
+    (folder / "mine").mkdir()
+    (folder / "mine" / "own.py").write_text(OWN)
+    (folder / "elbow.yaml").write_text(ELBOW)
+    (folder / "swim.yaml").write_text(json.dumps(SETTINGS))
+    return folder
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A configuration that names own code; the current folder is its folder."""
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "own.py").write_text(OWN)
-    (tmp_path / "elbow.yaml").write_text(ELBOW)
-    (tmp_path / "swim.yaml").write_text(json.dumps(SETTINGS))
+    """Such a folder, current."""
     monkeypatch.chdir(tmp_path)
-    return tmp_path
+    return fill(tmp_path)
 
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
     """The fitness of such a configuration, compiled once."""
-    folder = tmp_path_factory.mktemp("own")
-    (folder / "mine").mkdir()
-    (folder / "mine" / "own.py").write_text(OWN)
-    (folder / "elbow.yaml").write_text(ELBOW)
-    (folder / "swim.yaml").write_text(json.dumps(SETTINGS))
+    folder = fill(tmp_path_factory.mktemp("own"))
     return make_fitness(folder / "swim.yaml", **{"task.params": {"height": 0.25}})
 
 

@@ -27,30 +27,27 @@ def rolled(x, body):
     return jax.lax.scan(lambda s, _: (body(s), None), x, None, length=5)[0]
 
 
+def turn(carry, row):
+    """A step of a carry with leaves of several shapes; a row comes in, and one goes out."""
+    x, (y, count, signs) = carry
+    x = step(x + row) + 0.1 * y[0]
+    y = jnp.stack([jnp.sin(x) * y[1], jnp.cos(x + y[0])])
+    return (x, (y, count + 1, signs + (x > 0))), x * y[1] * count
+
+
 def fused(x):
-    """Steps of a carry with leaves of several shapes, and rows that come in and go out."""
-
-    def turn(carry, row):
-        x, (y, count, signs) = carry
-        x = step(x + row) + 0.1 * y[0]
-        y = jnp.stack([jnp.sin(x) * y[1], jnp.cos(x + y[0])])
-        return (x, (y, count + 1, signs + (x > 0))), x * y[1] * count
-
     rows = jnp.linspace(0, 1, 7)
     carry = (x, (jnp.stack([x, -x]), jnp.zeros((), jnp.int32), jnp.zeros(x.shape, jnp.int32)))
-    turn, pack, unpack = fuse_step(turn, carry, rows[0])
-    packed, kept = jax.lax.scan(turn, pack(carry), rows)
+    packed_turn, pack, unpack = fuse_step(turn, carry, rows[0])
+    packed, kept = jax.lax.scan(packed_turn, pack(carry), rows)
     return unpack(packed), kept
 
 
 def plain(x):
     carry, kept = (x, (jnp.stack([x, -x]), 0, jnp.zeros(x.shape, jnp.int32))), []
     for row in np.linspace(0, 1, 7, dtype=np.float32):
-        x, (y, count, signs) = carry
-        x = step(x + row) + 0.1 * y[0]
-        y = jnp.stack([jnp.sin(x) * y[1], jnp.cos(x + y[0])])
-        kept.append(x * y[1] * count)
-        carry = (x, (y, count + 1, signs + (x > 0)))
+        carry, one = turn(carry, row)
+        kept.append(one)
     return carry, jnp.stack(kept)
 
 

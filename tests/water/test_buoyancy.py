@@ -116,21 +116,26 @@ def test_mask_is_all_or_nothing():
     assert not moment.any()
 
 
-def tilted(angle):
-    """A vertical that all three edges see, but for angle 0."""
-    return (0.6 * jnp.sin(angle), 0.8 * jnp.sin(angle), jnp.cos(angle))
+def everything(state, half):
+    """Share and moment at a depth and a vertical."""
+    share, moment = cut_box(tuple(state[1:]), state[0], tuple(half))
+    return jnp.stack([share, *moment])
 
 
 @jax.jit
 def table(depth, angle, half):
-    """Share and moment, and their slopes by depth and angle, of a row of depths."""
+    """Share and moment, and their slopes by depth and angle, of a row of depths.
 
-    def everything(depth, angle):
-        share, moment = cut_box(tilted(angle), depth, tuple(half))
+    The vertical is one that all three edges see, but for angle 0.
+    """
+
+    def tilted(depth, angle):
+        up = (0.6 * jnp.sin(angle), 0.8 * jnp.sin(angle), jnp.cos(angle))
+        share, *moment = everything((depth, *up), half)
         return jnp.stack([share, *(m / half.max() for m in moment)])
 
-    rows = jax.vmap(everything, (0, None))(depth, angle)
-    slope = jax.vmap(jax.jacfwd(everything, (0, 1)), (0, None))(depth, angle)
+    rows = jax.vmap(tilted, (0, None))(depth, angle)
+    slope = jax.vmap(jax.jacfwd(tilted, (0, 1)), (0, None))(depth, angle)
     return rows, jnp.concatenate([slope[0] * half.max(), slope[1]], 1)
 
 
@@ -197,12 +202,6 @@ STATES = {
 }
 
 
-def everything(state, half):
-    """Share and moment at a depth and a vertical."""
-    share, moment = cut_box(tuple(state[1:]), state[0], tuple(half))
-    return jnp.stack([share, *moment])
-
-
 run, *slopes = map(jax.jit, (everything, jax.jacfwd(everything), jax.jacrev(everything)))
 
 
@@ -230,12 +229,8 @@ def test_gradients_are_finite_everywhere(x64):
     up = np.concatenate([SPECIAL, attitudes(40)]).astype(kind)
     reach = np.abs(up) @ np.array(half, kind)
     with jax.enable_x64(x64):
-
-        def everything(depth, up):
-            share, moment = cut_box(tuple(up), depth, half)
-            return jnp.stack([share, *moment])
-
-        slopes = jax.jit(jax.vmap(jax.jacrev(everything, (0, 1))))
+        at = lambda depth, up: everything((depth, *up), half)  # noqa: E731
+        slopes = jax.jit(jax.vmap(jax.jacrev(at, (0, 1))))
         for level in (-1e6, -1, -half[0], 0, half[0], 1, 1e6):
             depth = (np.sign(level) * abs(level) * reach).astype(kind)
             by_depth, by_up = slopes(depth, up)

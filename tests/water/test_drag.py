@@ -26,7 +26,6 @@ from mjx_revolve.water.mujoco_drag import (
 )
 
 RHO = 999.1026
-G = 9.81
 MUJOCOS_GEOM = np.array([1, *ELLIPSOID.mj_fluidcoef, *6 * [0.0]])  # without virtual mass
 BRICK = ((0.041, 0.041, 0.0355), 0.0102 + 0.005, 1.07e-5)  # with 5 g of ballast, or it floats
 
