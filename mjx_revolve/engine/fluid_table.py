@@ -172,7 +172,7 @@ def make_fluid_table(
         return np.broadcast_to(value, 3) if c.per_axis else value
 
     def column(look: Callable[[Part], Any]) -> np.ndarray:
-        """`[npart, ...]` the same as numbers."""
+        """`[npart, ...]` a number of each part, read once for parts that are the same."""
         return np.array([look(p) for p in parts])[kind]
 
     half = np.array([p.boxes[0].size for p in parts]) / 2
