@@ -105,7 +105,9 @@ def test_on_the_simulators_clock_the_data_are_the_closed_form(readings):
 )
 def test_bad_options_end_with_one_line_and_code_2(main, arguments, message, capsys):
     assert run_command(main, arguments) == 2
-    check_error(capsys.readouterr(), message)
+    captured = capsys.readouterr()
+    check_error(captured, message)
+    assert captured.out == ""
 
 
 def _result(name, rates, population=2048, peak=2.0**20):

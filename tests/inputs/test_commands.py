@@ -10,7 +10,7 @@ from importlib import metadata
 
 import pytest
 
-from laboratory import ROOT, check_error, refusal
+from laboratory import ROOT, refusal
 from mjx_revolve.inputs import packages
 from mjx_revolve.inputs.commands import (
     Parser,
@@ -77,7 +77,9 @@ def test_wrong_arguments_are_one_line_and_code_2(argv, message, capsys):
     parser.add_argument("--rate", type=whole(1, 9))
     parser.add_argument("--count", type=whole(1))
     assert run_command(lambda argv: parser.parse_args(argv) and 0, argv) == 2
-    check_error(capsys.readouterr(), f"error: {message}")
+    captured = capsys.readouterr()
+    assert captured.err.startswith(f"error: {message}") and captured.err.count("\n") == 1
+    assert captured.out == ""
 
 
 FULL = OSError(errno.ENOSPC, "No space left on device", "a.xml")
