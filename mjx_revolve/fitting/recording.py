@@ -32,7 +32,7 @@ _UNITS = {"_m": 1.0, "_cm": 1e-2, "_mm": 1e-3, "_s": 1.0, "_ms": 1e-3, "_us": 1e
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz", "roll", "pitch", "yaw", "depth", "mean_speed")
 _PLACE = ("x", "y", "z")
 _SENSED = tuple(f"{kind}.{axis}" for kind in ("gyro", "accel") for axis in "xyz")
-_SOURCE = re.compile(r"^(?P<column>.*?)(?:\*(?P<factor>[-+0-9.eE]+))?$")
+_SOURCE = re.compile(r"^(?P<column>.*?)(?:\*(?P<factor>[-+0-9.eE]+))?$", re.DOTALL)
 # Faster than any robot of modules swims [body lengths/s]; wrong units are beyond it. A choice.
 _FASTEST = 30.0
 # And turns so fast [rad/s]: twice a second, noise of frames with it; degrees are beyond. A choice.

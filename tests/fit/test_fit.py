@@ -467,6 +467,8 @@ def test_units_gaps_and_factors_of_columns(auv, tmp_path):
     write_csv(tmp_path / "swim.csv", {k: v[kept] for k, v in columns.items()})
     with pytest.raises(InputError, match=r"--map x: expected a number after \*; found '1e'"):
         load_recording(tmp_path / "swim.csv", auv, read_map(["time=frame*0.05", "x=px*1e"]))
+    with pytest.raises(InputError, match=r"--map x: expected one of the columns .*found 'p\\nx'"):
+        load_recording(tmp_path / "swim.csv", auv, read_map(["time=frame*0.05", "x=p\nx"]))
     given = read_map(["time=frame*0.05", "x=px*0.002"])
     found = load_recording(tmp_path / "swim.csv", auv, given)
     for name in ("x", "y", "yaw"):
