@@ -741,12 +741,11 @@ def _check_fit(columns: StepConstants, order: RowOrder, capacity: Capacity) -> N
     for k, laws in enumerate(columns.laws):
         if laws not in room and not laws.idle:
             part = int(np.argmax(columns.part_laws == k))
-            shown = lambda x: tuple(x) if x.coupled else tuple(x)[:3]  # noqa: E731
-            known = [shown(x) for x in room]
-            raise InputError(
-                f"robot {names[assembly.layout.body[part]]!r}: expected parts under one of the "
-                f"laws {known} (buoyancy, drag, thruster, stated 6×6); found {shown(laws)}"
-            )
+            shown = lambda x: tuple(x) if x.coupled or x.stated else tuple(x)[:3]  # noqa: E731
+            expected = f"parts under one of the laws {sorted(map(shown, room))} (buoyancy, drag, "
+            expected += "thruster, stated 6×6, stated added mass)"
+            name = names[assembly.layout.body[part]]
+            raise InputError(f"robot {name!r}", expected, shown(laws))
     slots = np.ones(len(order.length), int)
     np.maximum.at(slots, order.robot, 1 + order.slot)
     for what, counts, most in (
