@@ -232,7 +232,10 @@ def _swim(fitness: Fitness, genes: jax.Array, key: jax.Array) -> Iterator[tuple[
         finer = {part: found.result()[usual].mean() for part, found in fine.items()}
     own = scores[usual][:_STARTS]
     first = own[:_FEW]
-    trials = scores[usual][_STARTS:].reshape(-1, _FEW)
+    # A slow turn or rise that is foretold from a short swim may be one that ends: variants are
+    # compared by what they really swim.
+    lasting = scores[usual if fitness.settings.horizon is None else max(scores)]
+    trials = lasting[_STARTS:].reshape(-1, _FEW)
     rest = float(trials[-1].mean())
     # A score that is no rate has no zero of its own: what counts is what the brain adds to rest.
     rates = unit.endswith("/s")
@@ -261,9 +264,9 @@ def _swim(fitness: Fitness, genes: jax.Array, key: jax.Array) -> Iterator[tuple[
         change = float(abs(mean - first.mean()) / scale)
         yield f"step_over_{part}", Check(f"change at 1/{part} of the step", change, most=STEP)
     for (name, (words, _)), found in zip(tried.items(), trials, strict=False):
-        yield name, Check(f"{whole} with {words}", share(found, first), least=VARIED)
+        yield name, Check(f"{whole} with {words}", share(found, lasting[:_FEW]), least=VARIED)
     if rates:  # should have no score at all; less is no gain
-        still = max(share(trials[-1], first), 0.0)
+        still = max(share(trials[-1], lasting[:_FEW]), 0.0)
         yield "brainless", Check("share with joints at rest", still, most=BRAINLESS)
     else:
         yield "brainless", Check("score with joints at rest", rest, unit)
@@ -323,8 +326,7 @@ def _scores(
 
     def spec(seconds: float) -> Fitness:
         changes = {"duration": seconds, "trials": _STARTS, "robust": None}
-        horizon = fitness.settings.horizon
-        if horizon is not None and seconds >= horizon:  # nothing is left to foretell
+        if seconds > usual:  # it is swum, not foretold
             changes["horizon"] = None
         task = fitness.settings.model_copy(update=changes)
         return replace(fitness, config=fitness.config.model_copy(update={"task": task}))

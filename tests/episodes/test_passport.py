@@ -52,8 +52,8 @@ def test_what_only_drifts_fails_without_its_brain_alone(tmp_path, short):
     wide = passport._scores(fitness, genes.astype(np.float32), key, varied, True)[0.6]
     np.testing.assert_allclose(wide[:8], own, atol=1e-5)
     np.testing.assert_allclose(wide[64 + 6 * 8 :], own, atol=1e-5)  # nothing to silence
-    # What lasts as long as the horizon, or longer, is not foretold.
-    near = make_fitness(settings | {"task": TASK | {"horizon": 1.2}})
+    # What is swum for longer than the task lasts is not foretold.
+    near = make_fitness(settings | {"task": TASK | {"horizon": 2.4}})
     both = (
         passport._scores(x, genes.astype(np.float32), key, lanes, True) for x in (fitness, near)
     )
