@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -143,9 +142,9 @@ def load_asked(arguments: argparse.Namespace) -> Episode:
     Raises:
         InputError: as `load_episode`, or a file is not trusted (see `trust.opening`).
     """
-    named = attrgetter("path", "world", "duration", "seed", "individual", "modules")
-    with opening_episode(arguments):
-        return load_episode(*named(arguments))
+    a = arguments
+    with opening_episode(a):
+        return load_episode(a.path, a.world, a.duration, a.seed, a.individual, a.modules)
 
 
 def _settings(duration: float | None) -> dict[str, float | None]:

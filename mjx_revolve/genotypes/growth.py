@@ -12,7 +12,7 @@ import numpy as np
 from mjx_revolve.body.boxes import boxes_overlap
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.placement import GROWN_TOLERANCE, Module, attach, frozen
-from mjx_revolve.body.tree import Morphology
+from mjx_revolve.body.tree import Morphology, free_name
 from mjx_revolve.genotypes.genotype import SLACK, Space, cached
 
 _ORIGIN = frozen(np.zeros(3)), frozen(np.eye(3))
@@ -133,11 +133,8 @@ class Growth:
 
     def _free_name(self, kind: ModuleType, path: tuple[int, ...]) -> str:
         """The name from `name_place`, made different from those of the seed's modules."""
-        stem = name = name_place(kind, path)
-        count = 2
-        while name in self._names:
-            name, count = f"{stem}_{count}", count + 1
-        return name
+        name = name_place(kind, path)
+        return free_name(name, self._names) if name in self._names else name
 
     def _take(self, module: Module, path: tuple[int, ...], shape: _Shape) -> None:
         """Adds a module that was checked."""
