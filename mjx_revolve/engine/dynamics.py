@@ -66,7 +66,7 @@ from mjx_revolve.numerics.spatial import (
     vscale,
     vsub,
 )
-from mjx_revolve.numerics.xla import take_lanes
+from mjx_revolve.numerics.xla import materialize, take_lanes
 from mjx_revolve.water.flow import Water, needs_horizontal_position
 from mjx_revolve.water.world import World
 
@@ -123,10 +123,7 @@ def accelerate(
 
     def axis_of(motion: BodyMotion) -> tuple[Vec, Vec]:
         """The hinge's axis, half a step ahead where momenta are."""
-        if symmetric:
-            return _AXIS
-        angular, linear = _coriolis(turning(motion), 0.5 * dt)
-        return vadd(_AXIS[0], angular), vadd(_AXIS[1], linear)
+        return _AXIS if symmetric else _axis_ahead(turning(motion), dt)
 
     def articulate(level: Level, children: Any, moved: Any, *xs: Any) -> tuple[Any, Any, Scalar]:
         """Articulated inertia and bias of bodies, seen from their parents; the root's own."""
@@ -163,9 +160,8 @@ def accelerate(
             symmetric,
         )
         block, bias = to_parent(rotation, level.hinges.position, block, bias, symmetric)
-        # Of a unit of the hinge's acceleration; else they are the row of `joint` and `_AXIS`.
-        unit = (column, axis) if meets and not symmetric else ()
-        saved = joint, tree.unstack_parts(submerged), unit
+        # Of a symmetric block it is the row of `joint`.
+        saved = joint, tree.unstack_parts(submerged), column if meets and not symmetric else ()
         return _flatten(block, bias, symmetric), saved, jnp.abs(motor * speed)
 
     children, saved, power = tree.backward_pass(
@@ -231,13 +227,18 @@ class _Factors(NamedTuple):
 
 
 def _look_at(
-    tree: Tree, factors: _Factors, steps: Any, hurry: Any, drift: jax.Array, which: jax.Array
+    tree: Tree, factors: _Factors, moving: tuple[Any, Any, jax.Array], dt: float, which: jax.Array
 ) -> Robots:
-    """The robots in the lanes `which`, as contacts look at them."""
+    """The robots in the lanes `which`, as contacts look at them.
+
+    `moving`: speeds, accelerations and levers of all robots' hinges, see `_with_contact`.
+    """
     few, places = tree.at_lanes(which), tree.hinge_positions(which)
     turns = tree.saved_at_lanes(factors.moved, lambda moved: moved[1], which)
-    own, faster = jax.tree.map(lambda x: take_lanes(x, which), (steps, hurry))
-    like = jnp.zeros(len(which), jax.tree.leaves(own)[0].dtype)
+    speed, hurry, lever = jax.tree.map(lambda x: take_lanes(x, which), moving)
+    like = jnp.zeros(len(which), lever.dtype)
+    hurry = few.join_rows(hurry, like)
+    drift = dt**2 * total(*[lever[k] * jnp.abs(hurry[k]) for k in range(len(lever))])
 
     def gather(_: Level, children: Any, *own: Any) -> Any:
         found = own if children is None else vadd(own, children)
@@ -249,17 +250,17 @@ def _look_at(
         return list(few.stack_saved(sums, lambda x: x, like))
 
     return Robots(
-        steps=few.join_rows(own, like),
-        hurry=few.join_rows(faster, like),
-        drift=take_lanes(drift, which),
+        steps=dt * (few.join_rows(speed, like) + dt * hurry),
+        hurry=hurry,
+        drift=drift,
         pose=lambda steps: body_frames(few, turns, places, few.split_rows(steps), like),
         carried=carried,
-        make_respond=lambda: _make_respond(tree, factors, which, turns, places),
+        make_respond=lambda: _make_respond(tree, factors, dt, which, turns, places),
     )
 
 
 def _make_respond(
-    tree: Tree, factors: _Factors, which: jax.Array, turns: Any, places: Any
+    tree: Tree, factors: _Factors, dt: float, which: jax.Array, turns: Any, places: Any
 ) -> Respond:
     """For some of the robots, what further torques of their hinges add to all accelerations."""
     lanes, symmetric = len(which), factors.symmetric
@@ -267,35 +268,42 @@ def _make_respond(
     block: Block = jax.tree.map(own, factors.root)
     saved = tree.saved_at_lanes(factors.saved, lambda saved: (saved[0][:3], saved[2]), which)
     few = tree.at_lanes(which)
+    # With which momenta turn.
+    velocities = (
+        ()
+        if symmetric
+        else (tree.saved_at_lanes(factors.moved, lambda moved: moved[0].midpoint_velocity, which),)
+    )
 
     def collect(_: Level, children: Any, turn: Any, place: Any, saved: Any, torque: Any) -> Any:
         """Bias forces, as the parents feel them."""
         bias = (0.0,) * 6 if children is None else children
-        (row_a, row_l, inverse), unit = saved
+        (row_a, row_l, inverse), column = saved
         rest = sub(torque, bias[2])
         pushed = mul(inverse, rest)
-        column = unit[0] if unit else (row_a, row_l)
+        column = column or (row_a, row_l)
         torque = vadd(bias[:3], vscale(pushed, column[0]))
         force = matvec(turn, vadd(bias[3:], vscale(pushed, column[1])))
         torque = vadd(matvec(turn, torque), cross(place, force))
         return (*torque, *force), rest, ()
 
     def accelerate_joint(
-        _: Level, parent: Any, turn: Any, place: Any, saved: Any, rest: Any
+        _: Level, parent: Any, turn: Any, place: Any, saved: Any, rest: Any, *velocity: Any
     ) -> Any:
         angular, linear = parent
         a = matTvec(turn, angular)
         b = matTvec(turn, vadd(linear, cross(angular, place)))
-        (row_a, row_l, inverse), unit = saved
+        (row_a, row_l, inverse), _column = saved
         hinge = mul(inverse, sub(sub(rest, dot(row_a, a)), dot(row_l, b)))
-        return _along(unit[1] if unit else _AXIS, hinge, (a, b)), hinge
+        axis = _axis_ahead(velocity[0], dt) if velocity else _AXIS
+        return _along(axis, hinge, (a, b)), hinge
 
     def respond(torque: jax.Array) -> jax.Array:
         bias, rests, _ = few.backward_pass(
             collect, ((0.0,) * 6, ()), turns, places, saved, few.split_rows(torque)
         )
         angular, linear = root = solve_root(block, (bias[:3], bias[3:]), symmetric)
-        hinges = few.forward_pass(accelerate_joint, root, turns, places, saved, rests)
+        hinges = few.forward_pass(accelerate_joint, root, turns, places, saved, rests, *velocities)
         like = torque[0]
         wide = [jnp.broadcast_to(x, (1, lanes)) for x in (*linear, *angular)]
         return jnp.concatenate([*wide, few.join_rows(hinges, like)])
@@ -311,14 +319,19 @@ def _with_contact(
     A robot is not looked at while its hinges cannot have turned far enough to close its clearance.
     """
     like = state.position[0]
-    steps = jax.tree.map(lambda v, a: dt * (v + dt * a), state.speed, qacc[2])
-    sweep = lambda steps: tree.join_rows(tree.map(_sweep, steps), like)  # noqa: E731
-    ways, drifts = sweep(steps), dt**2 * sweep(qacc[2])
-    drift = total(*[drifts[k] for k in range(len(drifts))])
+
+    def reach(level: Level, speed: Scalar) -> Scalar:
+        """How far boxes may near each other for each radian of each hinge [m]."""
+        assert level.hinges is not None
+        return jnp.broadcast_to(level.hinges.lever, speed.shape)
+
+    levers = tree.join_rows(tree.map(reach, state.speed), like)
+    speed, hurry = (materialize(tree.join_rows(x, like)) for x in (state.speed, qacc[2]))
+    ways = [levers[k] * jnp.abs(dt * (speed[k] + dt * hurry[k])) for k in range(len(levers))]
     found, clearance, pressed = contact_acceleration(
         tree.meetings(like),
-        state.clearance - total(*[ways[k] for k in range(len(ways))]),
-        lambda which: _look_at(tree, factors, steps, qacc[2], drift, which),
+        state.clearance - total(*ways),
+        lambda which: _look_at(tree, factors, (state.speed, qacc[2], levers), dt, which),
         6 + len(ways),
         dt,
         len(state.pressed),
@@ -326,12 +339,6 @@ def _with_contact(
     robot = tuple(found[:3]), tuple(found[3:6]), tree.split_rows(found[6:])
     sums: tuple[Vec, Vec, Any] = jax.tree.map(jnp.add, qacc, robot)
     return sums, clearance, pressed if len(state.pressed) else ()
-
-
-def _sweep(level: Level, step: Scalar) -> Scalar:
-    """By how much boxes may near each other by each hinge's turning [m]."""
-    assert level.hinges is not None
-    return mul(level.hinges.lever, jnp.abs(step))
 
 
 def midpoint_forces(
@@ -473,6 +480,12 @@ def _coriolis(velocity: tuple[Vec, Vec], speed: Scalar) -> tuple[Vec, Vec]:
     """Velocity times joint velocity (Featherstone's c_J): ν × (z q̇)."""
     angular, linear = ((mul(v[1], speed), neg(mul(v[0], speed)), 0.0) for v in velocity)
     return angular, linear
+
+
+def _axis_ahead(velocity: tuple[Vec, Vec], dt: float) -> tuple[Vec, Vec]:
+    """A hinge's axis half a step ahead, where momenta are that turn with such velocities."""
+    angular, linear = _coriolis(velocity, 0.5 * dt)
+    return vadd(_AXIS[0], angular), vadd(_AXIS[1], linear)
 
 
 def _flatten(block: Block, bias: tuple[Vec, Vec], symmetric: bool) -> tuple[Any, ...]:
