@@ -45,8 +45,10 @@ from mjx_revolve.water.world import World
 PASSPORT = "champion/passport.yaml"
 """Its place in a run folder."""
 
-# How long it swims [s], and after which other time its score is looked at.
-_LONG, _MIDDLE = 120.0, 30.0
+LONG = 120.0
+"""How long it swims [s]."""
+# After which other time its score is looked at [s].
+_MIDDLE = 30.0
 # Fresh starts; and how many of them the variants are tried from.
 _STARTS, _FEW = 64, 8
 # By which coefficients of water and motors differ: what is not known of them, doubled. Drag of
@@ -322,7 +324,7 @@ def _scores(
     """
     coarse, usual = fitness, fitness.config.task.duration
     fitness = fitness if part == 1 else _with_step(fitness, part)
-    times = [usual, *(t for t in (_MIDDLE, _LONG) if long and t > usual)]
+    times = [usual, *(t for t in (_MIDDLE, LONG) if long and t > usual)]
 
     def spec(seconds: float) -> Fitness:
         changes = {"duration": seconds, "trials": _STARTS, "robust": None}

@@ -37,6 +37,8 @@ from mjx_revolve.inputs.errors import InputError
 
 # Random bodies from which the number of parts in a row of the tables follows. A choice.
 _EXAMPLES = 64
+# Episodes of each body whose scores over a long time are looked at. A choice: as many coefficients.
+_LONG_TRIALS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,16 +93,42 @@ class BodyFitness:
 
         As in passports, in the world's own water.
         """
-        found = []
-        for part in (1, 2):
-            changes: dict[str, Any] = {
-                "world.timestep": self.mixed.world.timestep / part, "task.robust": None,
-            }  # fmt: skip
-            mixed = make_mixed_fitness(self.config, bodies, **changes)
-            robots = [mixed.build(body) for body in bodies]
-            padded = [mixed.pad_genes(own, robot) for own, robot in zip(genes, robots, strict=True)]
-            found.append(np.asarray(mixed(mixed.pack(robots), np.stack(padded), key)))
-        return np.abs(found[1] - found[0]) / np.maximum(np.abs(found[0]), 1e-9)
+        half = {"world.timestep": self.mixed.world.timestep / 2}
+        usual, fine = (self._scores_with(bodies, genes, key, **x) for x in ({}, half))
+        return np.abs(fine - usual) / np.maximum(np.abs(usual), 1e-9)
+
+    def kept_shares(
+        self,
+        bodies: Sequence[Morphology],
+        genes: Sequence[np.ndarray],
+        key: jax.Array,
+        seconds: float,
+    ) -> np.ndarray:
+        """`[bodies]` shares of scores, as rates, that bodies with brains keep for so long.
+
+        Swum, not foretold, in water and with motors of all of the task's range, while the score is
+        that of the usual time in the world's own water.
+        """
+        task = self.config.task
+        swum: dict[str, Any] = {
+            "task.duration": seconds, "task.horizon": None, "task.trials": _LONG_TRIALS,
+            "task.robust": task.robust and task.robust.model_dump(),
+        }  # fmt: skip
+        usual, kept = (self._scores_with(bodies, genes, key, **x) for x in ({}, swum))
+        return kept / np.maximum(usual, 1e-9)
+
+    def _scores_with(
+        self,
+        bodies: Sequence[Morphology],
+        genes: Sequence[np.ndarray],
+        key: jax.Array,
+        **changes: Any,
+    ) -> np.ndarray:
+        """`[bodies]` scores of bodies with brains, with other settings; robust only if so given."""
+        mixed = make_mixed_fitness(self.config, bodies, **({"task.robust": None} | changes))
+        robots = [mixed.build(body) for body in bodies]
+        padded = [mixed.pad_genes(own, robot) for own, robot in zip(genes, robots, strict=True)]
+        return np.asarray(mixed(mixed.pack(robots), np.stack(padded), key))
 
     @cached_property
     def identity(self) -> str:

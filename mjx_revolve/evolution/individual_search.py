@@ -10,7 +10,14 @@ import jax
 import numpy as np
 
 from mjx_revolve.episodes.config import Config
-from mjx_revolve.episodes.passport import STEP, Passport, joint_checks, make_passport
+from mjx_revolve.episodes.passport import (
+    KEPT,
+    LONG,
+    STEP,
+    Passport,
+    joint_checks,
+    make_passport,
+)
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.evolution.blocks import Scored, join
 from mjx_revolve.evolution.body_fitness import BodyFitness
@@ -75,9 +82,10 @@ class IndividualEvolution:
             return make_passport(self.fitness.body_fitness(one.body), one.genes, seed)
 
         def screen(indices: Sequence[int]) -> list[int]:
-            """1 where joints do in one episode what servos can, 2 where scores hold at half a step.
+            """1 where joints do in one episode what servos can, 1 more for each score that holds.
 
-            Populations come to fit their step together: one program for all is sooner done than a
+            At half the step, and over a long time in other water: populations come to fit their
+            step and what is foretold of them together. A program for all is sooner done than a
             passport of each.
             """
             robots = [self.fitness.build(candidates[k].body) for k in indices]
@@ -90,8 +98,10 @@ class IndividualEvolution:
                 for robot, trajectory in zip(robots, swum, strict=True)
             ]
             bodies = [candidates[k].body for k in indices]
-            holds = self.fitness.step_changes(bodies, genes, key) <= STEP
-            return [int(a) * (1 + int(b)) for a, b in zip(sound, holds, strict=True)]
+            chances = 1 + (self.fitness.step_changes(bodies, genes, key) <= STEP).astype(int)
+            if self.fitness.mixed.task.unit.endswith("/s") and self.config.task.duration < LONG:
+                chances += self.fitness.kept_shares(bodies, genes, key, LONG) >= KEPT
+            return [int(a) * int(b) for a, b in zip(sound, chances, strict=True)]
 
         winner, judged = choose_candidate(
             score, np.ones(len(candidates), bool), seed, judge if required else None, screen

@@ -131,7 +131,9 @@ def test_where_a_passport_is_required_the_living_are_candidates_too(folder, monk
     assert len(tried) == 2 and tried[0] in failing
 
 
-def test_those_that_hold_their_score_at_half_the_step_are_tried_first(folder, monkeypatch):
+@pytest.mark.parametrize("lasts", ["step_changes", "kept_shares"])
+def test_those_that_hold_their_score_are_tried_first(folder, monkeypatch, lasts):
+    """At half the step, and for two minutes."""
     config, executor = start(folder, {"selection": {"type": "plus", "passport": "required"}})
     search, _ = run(config, executor)
     candidates = individual_search.list_candidates(search, True)
@@ -141,12 +143,15 @@ def test_those_that_hold_their_score_at_half_the_step_are_tried_first(folder, mo
         tried.append(genes)
         return Passport({"kept": Check("kept", float(genes == last.genes), least=0.5)})
 
-    def changes(fitness, bodies, genes, key):
-        """Only the last one's score stays."""
-        return np.array([0.0 if body is last.body else 0.5 for body in bodies])
+    def last_lasts(name):
+        """The last one's score stays; those of others, too, of which this is not the test."""
+        bad, good = (0.5, 0.0) if name == "step_changes" else (0.5, 1.0)
+        stays = lambda body: name != lasts or body is last.body  # noqa: E731
+        return lambda _, bodies, *rest: np.array([good if stays(x) else bad for x in bodies])
 
     monkeypatch.setattr(individual_search, "make_passport", judged)
-    monkeypatch.setattr(type(executor.fitness), "step_changes", changes)
+    for name in ("step_changes", "kept_shares"):
+        monkeypatch.setattr(type(executor.fitness), name, last_lasts(name))
     monkeypatch.setattr(type(executor.fitness.mixed), "replay", lambda _, robots, genes, key: genes)
     monkeypatch.setattr(individual_search, "joint_checks", lambda *_: [])
     champion = BodyEvolution(config, executor).choose_champion(search)
