@@ -512,6 +512,11 @@ class Config(Settings):
         return "generation" if self.colony is None else "interval"
 
     @property
+    def has_user_code(self) -> bool:
+        """Whether the task or the controller is a function in a user's own file."""
+        return self.task.is_user_code or self.controller.is_user_code
+
+    @property
     def files(self) -> tuple[NamedFile, ...]:
         """The files that the settings name."""
         found: list[NamedFile] = []

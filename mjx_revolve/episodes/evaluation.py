@@ -262,7 +262,7 @@ class EpisodeSpec(ABC, Generic[B]):
             fast: as of `xla.jit`.
         """
         config = self.config
-        if config.task.is_user_code or config.controller.is_user_code:
+        if config.has_user_code:
             return StoredProgram(fun, None, fast)
         settings = config.task.model_dump_json(), config.controller.model_dump_json()
         made_of = name, settings, config.engine, self.world, self._bodies_key, more

@@ -92,7 +92,8 @@ class Fitness(EpisodeSpec[tuple[()]]):
 
     @property
     def _bodies_key(self) -> object:
-        body = self.robot.morphology
+        # Workers have copies of the file elsewhere, each time.
+        body = replace(self.robot.morphology, path=None)
         return body, with_sensors(self.config, body).model_dump_json()
 
     def __call__(self, population: ArrayLike, key: jax.Array) -> jax.Array:

@@ -5,6 +5,7 @@ Imports stand inside functions: a worker's threads are set before NumPy and JAX 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import statistics
 from collections.abc import Callable, Sequence
@@ -65,6 +66,7 @@ class Job:
         source: its name in messages.
         files: the files that it names, by the relative paths in it.
         make_fitness: makes the fitness; pickled by its name.
+        keeps_programs: whether the fitness is one of ours that keeps its programs on disk.
         limits: of the workers.
     """
 
@@ -72,6 +74,7 @@ class Job:
     source: str
     files: tuple[tuple[str, bytes], ...]
     make_fitness: MakeFitness
+    keeps_programs: bool
     limits: Limits
 
 
@@ -104,12 +107,14 @@ def make_job(config: Config, make_fitness: MakeFitness | None = None) -> Job:
     from mjx_revolve.episodes.config import Config
     from mjx_revolve.episodes.settings import copy_files
 
-    make = make_fitness or choose_fitness(config)
+    own = choose_fitness(config)
+    make = make_fitness or own
     name = function_name(make)
     if make.__module__ == "__main__" or "<" in name:
         raise ValueError(f"make_fitness: expected a function that can be imported; found {name}")
     settings, files = copy_files(config.model_dump(), Config)
-    return Job(json.dumps(settings), config.source, tuple(files.items()), make, LIMITS)
+    keeps = make is own and not config.has_user_code
+    return Job(json.dumps(settings), config.source, tuple(files.items()), make, keeps, LIMITS)
 
 
 def open_job(job: Job, scratch: str | Path) -> Any:
@@ -134,14 +139,20 @@ def open_job(job: Job, scratch: str | Path) -> Any:
 
 
 def compile_job(job: Job, fitness: object) -> None:
-    """Compiles a fitness; of a host's workers the first does, and the others read its cache."""
+    """Compiles a fitness; of a host's workers the first does, and the others read its cache.
+
+    What keeps its programs on disk has a lock for each: all workers read them at once.
+    """
     import jax
 
     from mjx_revolve.evolution.blocks import evaluate_block, example_block
     from mjx_revolve.evolution.fingerprints import hash_text
 
     example = example_block(fitness, json.loads(job.config)["evolution"]["population_size"])
-    with runtime.compile_lock("job", hash_text(function_name(job.make_fitness), job.config)):
+    lock: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
+    if not job.keeps_programs:
+        lock = runtime.compile_lock("job", hash_text(function_name(job.make_fitness), job.config))
+    with lock:
         evaluate_block(fitness, example, jax.random.key(0))
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import pickle
 import re
 import signal
 import subprocess
@@ -18,6 +19,7 @@ import pytest
 import toys
 from laboratory import OAR, ROOT, XLA_FLAGS
 from mjx_revolve import evolve as command
+from mjx_revolve.episodes import evaluation
 from mjx_revolve.episodes.config import load_config
 from mjx_revolve.evolution import jobs
 from mjx_revolve.evolution import run_folder as runs
@@ -169,6 +171,16 @@ def test_a_job_takes_all_files_along(tmp_path):
         (tmp_path / name).unlink()
     found = open_job(job, tmp_path / "scratch")
     assert found == ("id: robot\n", "def stay(track, settings):", "sea", b"grid")
+
+
+def test_programs_do_not_depend_on_where_a_workers_files_lie(tmp_path, monkeypatch):
+    """A worker's copies lie in another folder each time; a program is kept for the next run's."""
+    made = []
+    monkeypatch.setattr(evaluation, "StoredProgram", lambda fun, made_of, _: made.append(made_of))
+    config = load_config("smoke")
+    for name in ("one", "another"):
+        open_job(make_job(config), tmp_path / name).keep(abs, "program")
+    assert pickle.dumps(made[0]) == pickle.dumps(made[1])
 
 
 def read_back(config):
