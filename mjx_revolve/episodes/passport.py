@@ -8,6 +8,7 @@ one program swim side by side; only another timestep is another program.
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
@@ -61,6 +62,9 @@ _PLAY = 0.02
 
 # The speed of a joint is looked at that it has for all but the fastest hundredth of the time.
 _OFTEN = 0.99
+
+# XLA's CPU back end can lock up when two programs run at once in one process.
+_RUNNING = threading.Lock()
 
 # What is required. All are choices, with these reasons.
 KEPT = 0.8
@@ -356,8 +360,9 @@ def _scores(
     # Kept, the programs are there for the next champion of this body.
     made_of = jax.tree.map(np.ndarray.tolist, lanes)
     # That of half a step is sooner swum than compiled well.
-    found = fitness.keep(run, "passport", made_of, times, fast=part == 2)(genes, key)
-    return {seconds: np.asarray(x, float) for seconds, x in found.items()}
+    program = fitness.keep(run, "passport", made_of, times, fast=part == 2).load(genes, key)
+    with _RUNNING:
+        return {seconds: np.asarray(x, float) for seconds, x in program(genes, key).items()}
 
 
 def fresh_starts(whole: Fitness, usual: Fitness, world: World, key: jax.Array) -> Starts:

@@ -19,15 +19,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from jax import monitoring
 from jax.experimental import serialize_executable
 from jaxtyping import PyTree
 
 from mjx_revolve.numerics import runtime
 from mjx_revolve.numerics.xla import fuses, jit, on_cpu
 
-# The event that JAX records when it finds a program in its cache.
-_CACHE_HIT = "/jax/compilation_cache/cache_hits"
 # Programs that were not read for so long are removed [s].
 _LIFE = 30 * 86_400
 _log = logging.getLogger(__name__)
@@ -45,7 +42,7 @@ class StoredProgram:
                 are not all known: then nothing is kept.
             fast: as of `xla.jit`.
         """
-        self._jitted = jit(fun, fast=fast)
+        self._fun, self._jitted = fun, jit(fun, fast=fast)
         self._made_of = made_of, fast
         self._found: dict[Any, Any] = {}
 
@@ -55,12 +52,25 @@ class StoredProgram:
         if self._made_of[0] is None or folder is None or not on_cpu():
             return self._jitted(*args)
         args = jax.tree.map(jax.numpy.asarray, args)
+        return self._load(folder, args)(*args)
+
+    def load(self, *args: PyTree) -> Callable[..., PyTree]:
+        """What calls it with such arguments, compiled if need be, but not called yet."""
+        folder = runtime.program_folder()
+        args = jax.tree.map(jax.numpy.asarray, args)
+        if self._made_of[0] is None or folder is None or not on_cpu():
+            compiled: Callable[..., PyTree] = self._jitted.lower(*args).compile()
+            return compiled
+        return self._load(folder, args)
+
+    def _load(self, folder: Path, args: tuple[PyTree, ...]) -> Callable[..., PyTree]:
         leaves, tree = jax.tree.flatten((args, {}))
         shapes = tuple((x.shape, str(x.dtype), getattr(x, "weak_type", False)) for x in leaves)
         if (tree, shapes) not in self._found:
             path = folder / self._name(str(tree), shapes)
             self._found[tree, shapes] = _load(path, tree) or self._compile(path, args)
-        return self._found[tree, shapes](*args)
+        found: Callable[..., PyTree] = self._found[tree, shapes]
+        return found
 
     def cache_size(self) -> int:
         """Number of executables, one for each signature of the arguments."""
@@ -68,26 +78,31 @@ class StoredProgram:
 
     def _name(self, *signature: object) -> str:
         config: Any = jax.config
-        precision = config.jax_enable_x64, config.jax_default_matmul_precision
-        host = runtime.host_key(), precision, fuses(), os.environ.get("XLA_FLAGS")
+        modes = (
+            config.jax_enable_x64,
+            config.jax_default_matmul_precision,
+            config.jax_threefry_partitionable,
+        )
+        host = runtime.host_key(), modes, fuses(), os.environ.get("XLA_FLAGS")
         return hashlib.sha256(pickle.dumps((self._made_of, signature, host))).hexdigest()[:32]
 
     def _compile(self, path: Path, args: PyTree) -> Any:
         with runtime.compile_lock("program", path.name):
             if (found := _load(path, jax.tree.structure((args, {})))) is not None:
                 return found  # another process has compiled it meanwhile
-            lowered = self._jitted.lower(*args)
-            hits: list[str] = []
-            listen = lambda event, **_: hits.append(event) if event == _CACHE_HIT else None  # noqa: E731
-            monitoring.register_event_listener(listen)
-            try:
-                made = lowered.compile()
-            finally:
-                monitoring.unregister_event_listener(listen)
             # XLA:CPU (jaxlib 0.10.2) writes programs that it has itself read from JAX's cache
-            # without some of their functions: those are left to that cache.
-            if not hits:
-                _keep(path, made)
+            # without some of their functions. So that cache must not know it: by a name of its own.
+            name = f"{self._fun.__name__}_{path.name[:8]}_{time.time_ns()}"
+
+            def fun(*args: PyTree) -> PyTree:
+                return self._fun(*args)
+
+            fun.__name__ = name
+            made = jit(fun, fast=self._made_of[1]).lower(*args).compile()
+            _keep(path, made)
+            for entry in path.parent.parent.glob(f"jit_{name}-*"):  # it is not read again
+                with contextlib.suppress(OSError):
+                    entry.unlink()
         return made
 
 

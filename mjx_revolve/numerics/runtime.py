@@ -99,6 +99,7 @@ def _use_cache(folder: Path | None, min_compile_time: float) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", min_compile_time)
     global _programs
     _programs = folder / "programs" if folder else None
+    source_hash()  # of the source that is imported, whatever becomes of the files
 
 
 def program_folder() -> Path | None:
@@ -149,13 +150,14 @@ def compile_lock(kind: str, fingerprint: str) -> Iterator[None]:
         yield
         return
     # Few names, so that they do not pile up; two programs of one name wait for each other.
-    with open(Path(folder) / f".compiling-{kind}-{fingerprint[:2]}", "ab") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            fcntl.flock(lock, fcntl.LOCK_SH)
-        except OSError:  # a file system without locks
-            pass
+    with contextlib.ExitStack() as opened:
+        with contextlib.suppress(OSError):  # a folder that is read only, or without locks
+            name = f".compiling-{kind}-{fingerprint[:2]}"
+            lock = opened.enter_context(open(Path(folder) / name, "ab"))
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                fcntl.flock(lock, fcntl.LOCK_SH)
         yield
 
 
@@ -281,6 +283,7 @@ def cpu_model() -> str:
     return platform.processor() or platform.machine()
 
 
+@functools.cache
 def source_hash() -> str:
     """A fingerprint of this package's Python files and worlds: two of one version may differ.
 

@@ -2,6 +2,7 @@
 
 import os
 import time
+from unittest.mock import Mock
 
 import jax
 import jax.numpy as jnp
@@ -81,11 +82,42 @@ def test_unnamed_programs_are_not_kept_and_old_ones_are_removed(caches):
     assert file not in _programs(caches)
 
 
-def test_programs_of_jax_s_cache_are_left_to_it(caches):
-    # jaxlib writes such a program without some of its functions.
+def test_programs_that_jax_s_cache_knows_are_kept_whole(caches):
+    """As those of another version whose program is the same; jaxlib would write parts of them."""
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     traced = []
-    _check(_program("one", traced))
-    _check(_program("another", traced))
-    _check(_program("another", traced))
-    assert traced == ["one", "another", "another"] and len(_programs(caches)) == 1
+    for made_of in ("one", "another", "another"):
+        _check(_program(made_of, traced))
+    assert traced == ["one", "another"] and len(_programs(caches)) == 2
+    _programs(caches)[0].unlink()
+    for made_of in ("one", "another", "one", "another"):
+        _check(_program(made_of, traced))
+    assert len(traced) == 3 and len(_programs(caches)) == 2
+    assert not list(caches.glob("*fun*"))  # nothing is there twice
+
+
+def test_a_program_is_loaded_before_it_is_called(caches):
+    for made_of in ("one", None):
+        traced = []
+        program = _program(made_of, traced)
+        called = program.load(*ARGUMENTS)
+        assert traced == [made_of]
+        assert called(*ARGUMENTS)[0].tolist() == program(*ARGUMENTS)[0].tolist()
+        assert traced == [made_of]
+
+
+def test_a_folder_without_rights_takes_no_lock(caches, monkeypatch):
+    monkeypatch.setattr("builtins.open", Mock(side_effect=PermissionError))
+    with runtime.compile_lock("job", "one"):
+        pass
+
+
+def test_random_numbers_of_another_kind_are_another_program(caches):
+    def fun(key):
+        return jax.random.normal(key, (3,))
+
+    found = []
+    for way in (True, False):
+        with jax.threefry_partitionable(way):
+            found.append(StoredProgram(fun, "draws")(jax.random.key(0)).tolist())
+    assert found[0] != found[1] and len(_programs(caches)) == 2
