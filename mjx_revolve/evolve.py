@@ -132,7 +132,7 @@ def _lead(
         from mjx_revolve.evolution.executor import choose_workers
         from mjx_revolve.evolution.processes import start_workers
 
-        count = arguments.workers or (choose_workers(config) if config else 1)
+        count = arguments.workers or choose_workers(config)
         if count > 1:
             started += start_workers(count, runtime.find_cache())
         for worker in started:
@@ -162,26 +162,27 @@ def _lead(
         run.close()
 
 
-def _check(arguments: argparse.Namespace, files: bool) -> Config | None:
-    """The configuration, a wrong one refused before JAX is imported; None: no run folder.
+def _check(arguments: argparse.Namespace, files: bool) -> Config:
+    """The configuration; a wrong one, or a wrong folder, is refused before JAX is imported.
 
     `files`: whether those that it names are read, too; another fitness may have others.
     """
     path, folder = arguments.config, arguments.resume
     from mjx_revolve.episodes.config import load_config
     from mjx_revolve.episodes.named_files import check_files
+    from mjx_revolve.evolution.run_folder import check_new_folder, check_run_folder
 
     if folder is None:
         with opening_config(path, arguments.trust):
             config = load_config(path, arguments.settings)
             if files:
                 check_files(config)
+            if arguments.out is not None:
+                check_new_folder(arguments.out)
             return config
     if path is not None:
         find_shipped(path, "configs")  # a name that there is not is known at once
-    found = Path(folder) / "config.yaml"
-    if not found.is_file():  # its folder is checked when it is locked
-        return None
+    found = check_run_folder(folder) / "config.yaml"
     with opening(folder, *([path] if path else []), trust=arguments.trust):
         return load_config(found, () if path else arguments.settings)
 

@@ -20,10 +20,12 @@ def check_files(config: Config) -> None:
         InputError: a file is wrong.
     """
     read_world(config)
-    if config.morphology is None:
-        read_modules(config)
-    else:
+    if config.morphology is not None:
         read_morphology(config)
+        return
+    modules = read_modules(config)
+    for path in config.bodies.seeds if config.bodies is not None else ():
+        load_morphology(path, modules, config.allow_overlap)
 
 
 def read_world(config: Config) -> World:

@@ -37,7 +37,7 @@ from mjx_revolve.inputs.errors import InputError
 
 # Random bodies from which the number of parts in a row of the tables follows. A choice.
 _EXAMPLES = 64
-# Episodes of each body whose scores over a long time are looked at. A choice: as many coefficients.
+# Long episodes of each body that are looked at, each with coefficients of its own. A choice.
 _LONG_TRIALS = 8
 
 
@@ -159,7 +159,7 @@ class BodyFitness:
 
     @cached_property
     def build(self) -> Callable[[Morphology], Robot]:
-        """Body → robot, with a cache of the last generations'."""
+        """Body → robot, with a cache of the last generations' in the run's own process."""
         return cached(self.mixed.build)
 
     @cached_property

@@ -379,6 +379,15 @@ def open_run_folder(folder: str | Path) -> RunFolder:
     Raises:
         InputError: it is no run folder, or another process is writing it.
     """
+    return _lock_run(check_run_folder(folder))
+
+
+def check_run_folder(folder: str | Path) -> Path:
+    """The absolute path of a run folder that can be continued.
+
+    Raises:
+        InputError: it is none.
+    """
     folder = Path(folder).absolute()
     if not folder.is_dir():
         found = "a file" if folder.exists() else "none"
@@ -392,7 +401,7 @@ def open_run_folder(folder: str | Path) -> RunFolder:
             raise InputError(folder, "a run folder", f"no {name} in it")
     for path in folder.iterdir():
         _check_writable(path, folder)
-    return _lock_run(folder)
+    return folder
 
 
 def _check_writable(path: Path, folder: Path) -> None:
