@@ -207,6 +207,8 @@ class RobustConfig(Settings):
 @also(OFF, {"const": True})
 def _read_robust(value: object) -> object:
     """`true` as the default range of each coefficient."""
+    if isinstance(value, str | int | float) and value is not True and not is_off(value):
+        raise ConstraintError("", "true, false or a mapping, such as {drag: 1.3}", show(value))
     return {} if value is True else None if is_off(value) else value
 
 

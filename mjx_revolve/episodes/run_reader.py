@@ -40,7 +40,10 @@ def find_run(path: str | Path) -> Path:
         folder = folder.parent
     check_no_sweep(folder)
     if not (folder / "config.yaml").is_file():
-        raise InputError(path, "a run folder", "no config.yaml in it")
+        found = (
+            "no config.yaml in it" if folder.is_dir() else "a file" if folder.exists() else "none"
+        )
+        raise InputError(path, "a run folder", found)
     return folder
 
 

@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import re
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from annotated_types import DocInfo, Ge, Gt, Le, Lt, Unit, doc
@@ -163,17 +163,19 @@ def _follow(annotation: object, steps: Sequence[Step]) -> tuple[list[Step], Any]
     return taken, annotation
 
 
-def _names(kind: object, prefix: str = "") -> dict[str, str]:
-    """All fields' dotted names by their last part."""
-    found: dict[str, str] = {}
+def _names(kind: object, prefix: str = "") -> Iterator[str]:
+    """All fields' dotted names."""
     for name, field in fields_of(kind).items():
-        found |= {name: prefix + name, **_names(_open(field.annotation)[0], f"{prefix}{name}.")}
-    return found
+        yield prefix + name
+        yield from _names(_open(field.annotation)[0], f"{prefix}{name}.")
 
 
 def _suggest(name: str, known: Sequence[str], place: Sequence[Step], root: object) -> str:
-    """The most similar known name: of a sibling, or of a field in another section."""
-    for names in ({key: join(*place, key) for key in known}, _names(root)):
+    """The most similar known name: of a sibling, or of a field in a section of it, or another."""
+    section = join(*place) + "."
+    every = sorted(_names(root), key=lambda full: full.startswith(section))
+    others = {full.rpartition(".")[2]: full for full in every}
+    for names in ({key: join(*place, key) for key in known}, others):
         near = difflib.get_close_matches(name, names, n=1, cutoff=0.7)
         if near:
             return f"; did you mean {names[near[0]]}?"

@@ -255,7 +255,8 @@ def _force(flow: PartFlow, numbers: CrossFlowNumbers, world: World) -> Drag:
 
 CROSS_FLOW = PartDragLaw(
     name="cross_flow",
-    summary="drag across chains and rods, friction, wakes of chains' ends; elsewhere of faces",
+    summary="drag across chains and rods, friction, wakes of chains' ends; thin plates as "
+    "plate_wake, fins as fin_wake; elsewhere of faces",
     steepest=3.0,  # C_d of 1.75 across
     by_faces=True,
     coefficients=(
