@@ -104,7 +104,7 @@ class BodyFitness:
         key: jax.Array,
         seconds: float,
     ) -> np.ndarray:
-        """`[bodies]` shares of scores, as rates, that bodies with brains keep for so long.
+        """`[bodies]` shares of scores, as rates, that bodies with brains keep for `seconds` [s].
 
         Swum, not foretold, in water and with motors of all of the task's range, while the score is
         that of the usual time in the world's own water.
