@@ -29,12 +29,7 @@ from experiments.water_tank import (
 )
 from mjx_revolve.body.morphology import Morphology, load_morphology
 from mjx_revolve.control.controller import Controller
-from mjx_revolve.control.readings import (
-    EpisodeContext,
-    SensorReadings,
-    init_memory,
-    read_sensors,
-)
+from mjx_revolve.control.readings import EpisodeContext, SensorReadings, init_memory, read_sensors
 from mjx_revolve.engine.batch import Capacity, pack_bodies
 from mjx_revolve.engine.batched_trees import make_batched_trees
 from mjx_revolve.engine.plant import Plant
@@ -243,7 +238,7 @@ def with_motors(robot: Robot, factor: float) -> Robot:
 # bodies, four hinges about two axes. The elbow is one limb of two hinges. The oar has one hinge:
 # what has joints compiles no sooner than this.
 OAR = "body: {type: Core, children: {1: {type: ActiveHinge, children: {1: {type: FixedBrick}}}}}"
-_ARM = """
+ARM = """
 id: arm
 body:
   id: core
@@ -254,7 +249,7 @@ body:
             id: wrist, type: ActiveHinge, children: {1: {id: hand, type: FixedBrick}}}}}}}
     2: {id: tail, type: ActiveHinge, children: {1: {id: tip, type: ActiveHinge, orientation: 90}}}
 """
-_ELBOW = """
+ELBOW = """
 id: elbow
 body:
   id: core
@@ -319,16 +314,9 @@ def check_slope_at_rest(controller: Controller, plant: Plant, sense: SensorReadi
     assert jnp.all(jnp.isfinite(slope))
 
 
-def arm_robot(tank: World) -> Robot:
-    """The arm in a world."""
-    return build_robot(read(_ARM), tank)
+def _made_of(text: str) -> Callable[[World], Robot]:
+    """What builds a robot from the text of its YAML."""
+    return lambda tank: build_robot(read(text), tank)
 
 
-def elbow_robot(tank: World) -> Robot:
-    """The elbow in a world."""
-    return build_robot(read(_ELBOW), tank)
-
-
-def oar_robot(tank: World) -> Robot:
-    """The oar in a world."""
-    return build_robot(read(OAR), tank)
+arm_robot, elbow_robot, oar_robot = map(_made_of, (ARM, ELBOW, OAR))

@@ -19,9 +19,7 @@ from experiments import (
     validation,
     validation_cases,
 )
-from experiments import (
-    revolve2_comparison as comparison,
-)
+from experiments import revolve2_comparison as comparison
 from experiments.falling_spider import (
     GAZEBO_GRAVITY,
     closed_form,

@@ -11,18 +11,8 @@ def ratios(rows):
     return {row.what: row.ratio for row in rows}
 
 
-@pytest.fixture(scope="module")
-def steady():
-    return measured_cases.steady_drag()
-
-
-@pytest.fixture(scope="module")
-def on_faces():
-    return measured_cases.steady_drag("faces")
-
-
-def test_a_rod_meets_what_a_rod_meets(steady, on_faces):
-    found, before = ratios(steady.rows), ratios(on_faces.rows)
+def test_a_rod_meets_what_a_rod_meets():
+    found, before = (ratios(measured_cases.steady_drag(*x).rows) for x in ((), ("faces",)))
     assert found["square rod, face on"] == pytest.approx(1.75 / 2.0, rel=1e-6)
     assert found["square rod, edge on"] == pytest.approx(1.75 / 2**0.5 / 1.6, rel=1e-6)
     for name in ("square plate, broadside", "disc, broadside"):
@@ -41,12 +31,8 @@ def test_a_plate_sinks_by_its_drag():
     assert all(abs(x.ratio - 1) < 0.1 for x in (row, found))
 
 
-@pytest.fixture(scope="module")
-def polars():
-    return measured_cases.polars(drag="faces")
-
-
-def test_plates_lift_as_measured_before_they_stall(polars):
+def test_plates_lift_as_measured_before_they_stall():
+    polars = measured_cases.polars(drag="faces")
     for polar in data.POLARS:
         angle, lift = polars.lines[polar.module, "lift"]
         ours = np.interp(polar.angle, angle, lift)

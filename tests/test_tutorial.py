@@ -20,9 +20,11 @@ from typing import NamedTuple
 import pytest
 import yaml
 
-from laboratory import ROOT
+from laboratory import ROOT, check_error
+from mjx_revolve import evolve
 from mjx_revolve.episodes.config import load_config
 from mjx_revolve.episodes.tasks import score_unit
+from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.numerics.xla import OLD_EMITTERS
 from mjx_revolve.view.report.data import read_run
 
@@ -178,13 +180,10 @@ def test_the_settings_that_it_proposes_exist(files, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_mistake_that_it_mentions_is_one_line(files):
+def test_the_mistake_that_it_mentions_is_one_line(files, monkeypatch, capsys):
+    monkeypatch.chdir(files)
     own = (files / "mine" / "tasks.py").read_text()
     (files / "mine" / "slip.py").write_text(own.replace("track.position -", "track.positions -"))
-    command = (
-        ".venv/bin/python -m mjx_revolve.evolve mine/stay.yaml --set task.type=mine/slip.py:stay"
-    )
-    place = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command.split(), cwd=files, env=place, capture_output=True, text=True)
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1 and "mine/slip.py: line 6: expected stay to" in done.stderr
+    argv = ["mine/stay.yaml", "--set", "task.type=mine/slip.py:stay", "--workers", "1"]
+    assert run_command(evolve.main, argv) == 2
+    check_error(capsys.readouterr(), "mine/slip.py: line 6: expected stay to")

@@ -51,12 +51,6 @@ def check_valid(body: Morphology) -> None:
     assert len({module.name for module in body.modules}) == body.num_modules
 
 
-def in_order(item: dict) -> dict:
-    """A tree of modules whose slots are in order."""
-    children = sorted(item.get("children", {}).items())
-    return {**item, "children": {slot: in_order(child) for slot, child in children}}
-
-
 def names(body: Morphology) -> list[str]:
     return [module.name for module in body.modules]
 

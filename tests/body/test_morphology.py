@@ -3,7 +3,6 @@
 import math
 import pickle
 import random
-from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from laboratory import OURS, ROOT, WILD, body, check_refused, refusal, write
+from laboratory import OURS, ROOT, WILD, body, check_refused, refusal, world, write
 from mjx_revolve.body.catalogue import MODULES, THESIS_MODULES, LiftDrag
 from mjx_revolve.body.coefficients import read_morphology_files
 from mjx_revolve.body.exposure import exposure
@@ -23,6 +22,7 @@ from mjx_revolve.body.morphology import (
     save_morphology,
     trim_neutral,
 )
+from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.inputs.errors import InputError
 
 WATER = 999.1026  # kg/m³, the thesis's
@@ -87,28 +87,14 @@ def test_spider_hips_are_vertical_and_knees_across_the_leg(spider, slot):
     assert thigh.rotation[:, 2] == pytest.approx([0, 0, 1])
 
 
-def link_masses(morphology: Morphology) -> list[float]:
-    """Masses of what is welded together: a hinge's first part stays, the rest moves."""
-    carrier: list[int] = []
-    masses: dict[int, float] = defaultdict(float)
-    for index, module in enumerate(morphology.modules):
-        link = carrier[module.parent] if module.parent >= 0 else -1
-        parts = module.kind.parts
-        if module.kind.hinge is not None:
-            masses[link] += parts[0].mass
-            link, parts = index, parts[1:]
-        masses[link] += sum(part.mass for part in parts)
-        carrier.append(link)
-    return sorted(masses.values())
-
-
 def test_thesis_masses_move_between_links_only():
     path = ROOT / "morphologies" / "spider.yaml"
     thesis = load_morphology(path, modules=THESIS_MODULES)
     assert thesis.mass == pytest.approx(0.2572, abs=1e-12)
     assert thesis.volume == body("spider").volume
     masses = [0.0119] * 4 + [0.0209] * 4 + [0.126]
-    assert link_masses(thesis) == pytest.approx(masses)
+    links = build_robot(thesis, world()).assembly.mass[1:]
+    assert sorted(links) == pytest.approx(masses)
     assert thesis != body("spider")
 
 

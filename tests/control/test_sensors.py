@@ -34,30 +34,30 @@ def watch(sensor, signal, noise=None):
         return np.asarray(jax.jit(lambda: jax.lax.scan(step, state, rows)[1])())[:, 0]
 
 
-def ramp(steps, slope=0.1):
-    """0, slope, 2 slope, ...: tells which step it was measured in."""
-    return slope * np.arange(steps)[:, None]
+RAMP = 0.01 * np.arange(19)  # tells in which of the steps of 10 ms it was measured
+GIVEN = {
+    "over its range": ({"range": 2.0}, [0.5, -1.0, 3.0, -np.inf], [0.25, -0.5, 1.0, -1.0]),
+    # 0 stays 0, and what lies below is clipped to it.
+    "from 0 on": ({"type": "depth", "range": (0, 4)}, [-1.0, 0.5, -5.0], [0.25, 0.0, 1.0]),
+    "around its middle": (
+        {"type": "depth", "range": (1.5, 2.5)}, [-1.0, -2.0, -2.4, -9.0], [-1.0, 0.0, 0.8, 1.0],
+    ),
+    # Measured at 0, 30, 50, 80 and 100 ms.
+    "40 Hz": ({"rate": 40.0}, RAMP[:12], RAMP[[0, 0, 0, 3, 3, 5, 5, 5, 8, 8, 10, 10]]),
+    "faster than the steps": ({"rate": 1000.0}, RAMP[:5], RAMP[:5]),
+    # Before that, the first value.
+    "three steps late": ({"delay": 0.03}, 0.5 + RAMP[:7], 0.5 + RAMP[[0, 0, 0, 0, 1, 2, 3]]),
+    "20 Hz, late": ({"rate": 20.0, "delay": 0.03}, RAMP[:14], RAMP[[0] * 8 + [5] * 5 + [10]]),
+    # A sample of 50 ms is due at 125 ms: the step at 130 ms is the first to have it.
+    "20 Hz, later": ({"rate": 20.0, "delay": 0.075}, RAMP, RAMP[[0] * 13 + [5] * 5 + [10]]),
+}  # fmt: skip
 
 
-def test_a_plain_sensor_gives_the_value_over_its_range():
-    found = watch(Sensor(type="climb", range=2.0), [[0.5], [-1.0], [3.0], [-np.inf]])
-    assert found[:, 0] == pytest.approx([0.25, -0.5, 1.0, -1.0])
-    # A range from 0 on: 0 stays 0, and what lies below is clipped to it.
-    found = watch(Sensor(type="depth", range=(0, 4)), [[-1.0], [0.5], [-5.0]])
-    assert found[:, 0] == pytest.approx([0.25, 0.0, 1.0])
-    # One that does not hold 0 counts from its middle.
-    found = watch(Sensor(type="depth", range=(1.5, 2.5)), [[-1.0], [-2.0], [-2.4], [-9.0]])
-    assert found[:, 0] == pytest.approx([-1.0, 0.0, 0.8, 1.0])
-
-
-def test_a_rate_samples_and_holds():
-    """At 40 Hz and steps of 10 ms: measured at 0, 30, 50, 80 and 100 ms."""
-    found = watch(Sensor(type="climb", rate=40.0), ramp(12, 0.01))
-    expected = [0, 0, 0, 3, 3, 5, 5, 5, 8, 8, 10, 10]
-    assert found[:, 0] == pytest.approx(0.01 * np.array(expected))
-    # Faster than the steps is at each step.
-    found = watch(Sensor(type="climb", rate=1000.0), ramp(5, 0.01))
-    assert found[:, 0] == pytest.approx(0.01 * np.arange(5))
+@pytest.mark.parametrize("case", GIVEN)
+def test_what_a_sensor_gives(case):
+    sensor, signal, expected = GIVEN[case]
+    found = watch(Sensor(**{"type": "climb"} | sensor), np.array(signal)[:, None])
+    assert found[:, 0] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("dt", "duration"), [(0.005, 7200), (0.01, 7200), (0.02, 14400)])
@@ -68,23 +68,6 @@ def test_no_sample_is_missed_however_long_it_lasts(dt, duration):
         time = jnp.asarray(steps, jnp.float32) * jnp.float32(dt)
         found = count_samples(time, 1 / (every * dt))
         assert (np.diff(np.asarray(found)[::every]) == 1).all()
-
-
-def test_a_delay_gives_what_was():
-    """Three steps late; before that, the first value."""
-    found = watch(Sensor(type="climb", delay=0.03), 0.5 + ramp(7, 0.01))
-    assert found[:, 0] == pytest.approx(0.5 + 0.01 * np.array([0, 0, 0, 0, 1, 2, 3]))
-
-
-def test_rate_and_delay_together():
-    """Samples at 0, 50 and 100 ms are there 30 ms later; and one and a half samples later."""
-    expected = np.array([0, 0, 0, 0, 0, 0, 0, 0, 5, 5, 5, 5, 5, 10])
-    found = watch(Sensor(type="climb", rate=20.0, delay=0.03), ramp(14, 0.01))
-    assert found[:, 0] == pytest.approx(0.01 * expected)
-    found = watch(Sensor(type="climb", rate=20.0, delay=0.075), ramp(19, 0.01))
-    # A sample of 50 ms is due at 125 ms, so that the step at 130 ms is the first to have it.
-    expected = np.array([0] * 13 + [5] * 5 + [10])
-    assert found[:, 0] == pytest.approx(0.01 * expected)
 
 
 def test_noise_is_drawn_anew_for_each_sample_and_lane_and_stays_the_same():

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import body, box_robot, march, random_states, world
+from laboratory import WATER, body, box_robot, march, random_states, world
 from mjx_revolve.engine.contact import bed_contact, bed_plane
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.simulate import simulate
@@ -20,10 +20,9 @@ FLAT = Bed(kind="flat", height=-2.0)
 LEVEL, GENTLE, STEEP = (0.0, 0.0), (200.0, 50.0), (150.0, -250.0)
 
 
-def sink(bed, name="core", **fields):
+def sink(bed, name="core"):
     """A robot with water, drag and a bed."""
-    on = {"gravity": G, "buoyancy": "partial", "drag": "faces", "added_mass": True}
-    return build_robot(body(name), world(**on | fields, bed=bed))
+    return build_robot(body(name), world(**WATER, bed=bed))
 
 
 def above(robot, places, clear, seed=0, speed=0.1):
@@ -135,17 +134,10 @@ def test_a_core_lands_on_a_flat_bed_and_stays():
         assert np.diff(energy).max() < 0.05 * (start - energy[-1])
 
 
-@pytest.fixture(scope="module")
-def lake_core():
-    """A core dropped in the lake: on level ground, on a gentle slope and on a steep one."""
-    robot = sink(LAKE)
-    qpos, qvel = above(robot, [LEVEL, GENTLE, STEEP], 0.3)
-    return robot, *march(robot, 12.0, qpos, qvel, every=20)[1:3]
-
-
-def test_creep_stays_below_the_stated_speed(lake_core):
+def test_creep_stays_below_the_stated_speed():
     """Where tan(slope) is half of μ, the docstring's 1 mm/s law creeps at .6 mm/s."""
-    _, q, _ = lake_core
+    robot = sink(LAKE)
+    q = march(robot, 12.0, *above(robot, [LEVEL, GENTLE, STEEP], 0.3), every=20)[1]
     assert np.linalg.norm(q[-1, :2, 1] - q[-51, :2, 1]) / 5.0 < 0.0012
 
 
@@ -167,7 +159,7 @@ def test_a_spider_lands_and_stays(bed):
     assert speed.max() < (0.08 if bed is LAKE else 0.02)
 
 
-@pytest.mark.parametrize("timestep", [0.005, 0.0125, 0.02])
+@pytest.mark.parametrize("timestep", [0.005, 0.02])
 def test_light_bodies_come_to_rest_wholly(timestep):
     """A brick of 15 g and a plate of 12 g, tumbling: after 8 s nothing moves. As points lost the
     bed for what they fall in a step, most of them rocked for ever, at up to 1 rad/s."""

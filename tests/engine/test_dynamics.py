@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -178,19 +179,6 @@ def test_slanted_modules_have_our_water():
         )
 
 
-def test_a_body_of_equal_siblings_in_a_vacuum():
-    """Constants that are the same for a whole level must still be summed once per child."""
-    text = "id: x\nbody:\n  id: core\n  type: Core\n  children:\n"
-    leg = (
-        "{type: ActiveHinge, orientation: 90, children: {1: {type: FixedBrick, children: {1: %s}}}}"
-    )
-    text += "".join(
-        f"    {slot}: {leg % '{type: ActiveHinge, orientation: 90}'}\n" for slot in (1, 0)
-    )
-    robot = stock(build_robot(read(text), world(gravity=9.81)))
-    check_acceleration(robot, lanes=16)
-
-
 def test_several_children_upon_one_of_several_equal_links():
     """Two links alike, one with two children and one with none."""
     text = """
@@ -221,34 +209,29 @@ def test_trajectory_is_mujocos(drag):
 
 # With all that WATER has. One hinge will do, but in the last, as a servo moves those below it, too.
 BEDDED = {"bed": Bed(kind="flat", height=-0.3), "current": (0.1, 0.0, 0.0)}
+FIN = "body: {type: Core, children: {0: {type: ActiveHinge, children: {1: {type: Fin}}}}}"
 FULL = {
+    "core": (partial(build_robot, body("core")), {"current": CURRENT}),
     "bed": (oar_robot, BEDDED),
+    "auv": (partial(build_robot, body("auv")), {"current": CURRENT}),
+    "fin": (partial(build_robot, read(FIN)), {"current": CURRENT}),
     "ellipsoid": (oar_robot, {"drag": "ellipsoid"}),
     "plates": (oar_robot, {"drag": "lift_drag", "buoyancy": "mask", "current": CURRENT}),
     "two hinges": (elbow_robot, BEDDED),
 }
 
 
-def check(robot):
-    qpos, qvel, ctrl = drawn(robot, 4, speed=0.3)
-    qpos[2] = [-0.2, -0.05, 0.0, 0.1]
-    ctrl[:, 1] *= 3.0  # beyond its range: the servo stops there
-    check_engines(robot, qpos, qvel, ctrl)
-
-
 @pytest.mark.slow
-def test_the_two_engines_agree_on_one_module():
-    """Through the surface, with drag, carried water and a current, half a second in float64."""
-    check(build_robot(body("core"), world(**WATER, current=CURRENT)))
-
-
-@pytest.mark.slow
-@pytest.mark.sampled(1)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("case", FULL)
 def test_the_two_engines_agree(case):
-    """The same with hinges and servos, and each of the other laws."""
+    """Through the surface, half a second in float64; beyond its range a servo stops."""
     make, fields = FULL[case]
-    check(make(world(**WATER | fields)))
+    robot = make(world(**WATER | fields))
+    qpos, qvel, ctrl = drawn(robot, 4, speed=0.3)
+    qpos[2] = [-0.2, -0.05, 0.0, 0.1]
+    ctrl[:, 1] *= 3.0
+    check_engines(robot, qpos, qvel, ctrl)
 
 
 @pytest.mark.slow
@@ -334,26 +317,17 @@ def test_momentum_of_a_jointed_body_in_a_vacuum(arm):
         assert (states[1] - states[0]) / 2e-5 == pytest.approx(0.0, abs=1e-3)
 
 
-def check_order(make, steps):
-    """The end of half a second: what changes when the step halves, halves too, or better.
-
-    Carried water and drag are second order; servos, end stops and friction are first.
-    """
-    ends = []
-    for dt in steps:
-        robot = make(world(**WATER, timestep=dt))
-        qpos, qvel = at_rest(robot, 2, -0.5)
-        qpos[2, 1] = 0.0
-        qvel[:6] = 0.2
-        ctrl = np.full((robot.num_hinges, 2), 0.3)
-        ends.append(march(robot, 0.5, qpos, qvel, ctrl, every=round(0.1 / dt))[1][-1])
-    ratio = np.linalg.norm(ends[1] - ends[0]) / np.linalg.norm(ends[2] - ends[1])
-    assert ratio > 1.7
-
-
 @pytest.mark.slow
 def test_convergence_in_the_time_step():
-    check_order(lambda tank: build_robot(body("core"), tank), (0.004, 0.002, 0.001))
+    """After half a second: what changes when the step halves, halves too, or better."""
+    ends = []
+    for dt in (0.004, 0.002, 0.001):
+        robot = build_robot(body("core"), world(**WATER, timestep=dt))
+        qpos, qvel = at_rest(robot, 2, -0.5)
+        qpos[2, 1], qvel[:6] = 0.0, 0.2
+        ends.append(march(robot, 0.5, qpos, qvel, every=round(0.1 / dt))[1][-1])
+    ratio = np.linalg.norm(ends[1] - ends[0]) / np.linalg.norm(ends[2] - ends[1])
+    assert ratio > 1.7
 
 
 @pytest.mark.slow

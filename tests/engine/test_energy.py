@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_self_contact import fork
 
-from laboratory import _ARM, OAR, read
+from laboratory import ARM, OAR, read
 from mjx_revolve import build_robot, load_morphology, load_world, simulate
 from mjx_revolve.engine.energy import energy_balance
 from mjx_revolve.engine.variation import Variation
@@ -54,7 +54,7 @@ def test_arms_that_clap(timestep):
 
 @pytest.mark.long
 def test_a_crawler_gives_energy_to_the_bed():
-    robot, found = swing(read(_ARM), 0.08, bed={"kind": "flat", "height": -0.1})
+    robot, found = swing(read(ARM), 0.08, bed={"kind": "flat", "height": -0.1})
     own = balance(robot, found)
     assert own.contact > 0.02 * own.work and own.residual < 0.05
 

@@ -54,12 +54,6 @@ def test_the_setting():
     )
 
 
-@pytest.mark.parametrize("found", ["MJX", None])
-def test_a_wrong_setting(found):
-    expected = f"world lake: bed.contact: expected one of penalty, mjx; found {found!r}"
-    assert refusal(load_world, "lake", bed={"contact": found}) == expected
-
-
 REFUSED = (
     "bed.contact: expected 'penalty' with engine: population; found 'mjx' "
     "(choose engine: mjx, or contact: penalty)"

@@ -123,22 +123,10 @@ def test_fluid_table_of_the_catalogue():
     assert fluid.center_of_volume[0] == pytest.approx(0.0)
     plates = LIFT_DRAG.numbers(fluid, robot.world)
     assert plates.area[0] == pytest.approx(0.089 * 0.089)
-    # Two bricks on a core, face to face: each hides a face of the other.
-    chain = build_robot(
-        read("""
-body:
-  type: Core
-  children:
-    1: {type: FixedBrick, children: {1: {type: FixedBrick}}}
-"""),
-        world(),
-    ).fluid
-    middle, last = 1, 2
-    assert chain.exposed[middle][1] == pytest.approx(0.0, abs=0.02)
-    assert chain.exposed[last][1] == pytest.approx(0.5, abs=0.02)
-    assert chain.exposed[last][[0, 2]] == pytest.approx(1.0, abs=0.1)
-    brick = robot.fluid.added_mass.sum(), chain.added_mass[last]
-    assert brick[1][1] < brick[1][0]
+    # Of two bricks in a row, the outer carries less water along it: a face of it is joined.
+    two = "body: {type: Core, children: {1: {type: FixedBrick, children: {1: {type: FixedBrick}}}}}"
+    outer = build_robot(read(two), world()).fluid.added_mass[2]
+    assert outer[1] < outer[0]
 
 
 def test_the_bed_is_part_of_the_model():

@@ -114,12 +114,6 @@ def test_a_plate_that_is_pressed_flat_on_a_face_lies_still(timestep):
     assert np.abs(np.diff(later, axis=0)).max() / timestep < 2.0
 
 
-def test_without_self_contact_arms_pass_through_each_other():
-    robot = jaw(self_contact=False)
-    qpos, qvel = open_jaw(robot)
-    assert depths(robot, march(robot, 2.0, qpos, qvel, INWARDS)[1]).max() > 0.01
-
-
 def test_a_hinge_ends_where_its_neighbours_meet():
     """An arm on the inner side of a brick: its servo holder meets the core's other brick."""
     robot, free = (build_robot(fork(1, 0), water(self_contact=x)) for x in (True, False))
@@ -146,9 +140,6 @@ def test_a_hinge_ends_where_its_neighbours_meet():
         own = [model.geom_bodyid[list(pair)].tolist() for pair in pairs]
         counts.append(sum(hinge in pair for pair in own))
     assert counts[0] == counts[1] < counts[2]
-    qpos, qvel = at_rest(robot, height=-2.0)
-    angle = march(robot, 1.0, qpos, qvel, INWARDS)[1][-1, 7:, 0]
-    assert np.all(np.abs(np.abs(angle) - high[0]) < 0.02)
 
 
 @pytest.mark.parametrize("timestep", [0.0125, 0.02])
@@ -163,10 +154,6 @@ def test_a_hinge_that_is_pressed_against_its_end_lies_still(timestep):
     assert qpos[-1, 7:] == pytest.approx(np.clip(targets.T, low, high).T, abs=0.02)
 
 
-def one_step(robot, qpos, qvel, ctrl):
-    return march(robot, robot.world.timestep, qpos, qvel, ctrl)[2][0]
-
-
 @pytest.mark.slow
 def test_contact_keeps_momentum_and_takes_energy():
     """Of the same state, a step with and one without contact."""
@@ -178,9 +165,7 @@ def test_contact_keeps_momentum_and_takes_energy():
     qvel[:] = draw.normal(size=qvel.shape)
     qvel[6:] = 5 * np.sign(INWARDS) * draw.uniform(0, 1, (2, lanes))
     robot, free = limp(robot), limp(free)
-    after, alone = (
-        one_step(x, qpos, qvel, 0 * INWARDS + np.zeros((2, lanes))) for x in (robot, free)
-    )
+    after, alone = (march(x, x.world.timestep, qpos, qvel)[2][0] for x in (robot, free))
     hit = np.abs(after - alone).max(0) > 1e-6
     assert 5 < hit.sum() < lanes
     np.testing.assert_array_equal(after[:, ~hit], alone[:, ~hit])

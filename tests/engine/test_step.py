@@ -18,7 +18,6 @@ from laboratory import (
     at_rest,
     body,
     box_robot,
-    face_drag,
     limp,
     march,
     oar_robot,
@@ -185,19 +184,6 @@ def test_a_whole_rollout_does_not_know_how_fast_its_water_goes():
     assert other_work == pytest.approx(work, abs=1e-9)
 
 
-@pytest.mark.parametrize("added_mass", [False, True])
-def test_a_body_drifts_to_the_current(added_mass):
-    """From rest, in three currents at once, u - v = u / (1 + c u t / m); 0.5 % of it at 5 ms."""
-    current = np.array([0.3, -0.2, 0.1])
-    robot = box_robot(CUBE, 1.0, world(drag="faces", added_mass=added_mass, current=current))
-    time, _, v, _ = march(robot, 10.0, *at_rest(robot, 1, -5.0), every=20)
-    inertia = 1.0 + (RHO * robot.fluid.added_mass[0, 0] if added_mass else 0.0)
-    drag = face_drag(robot).linear[0, 0]
-    expected = current - current / (1 + drag * np.abs(current) * time[:, None] / inertia)
-    assert v[:, :3, 0] == pytest.approx(expected, abs=0.005 * 0.3)
-    assert np.linalg.norm(v[-1, :3, 0] - current) < 0.05
-
-
 def test_a_floating_box_goes_with_a_long_wave():
     """Its height is the surface's where it is, its velocity the water's, its deck level with it."""
     amplitude, length = 0.2, 40.0
@@ -258,8 +244,11 @@ def switched(switch):
     return winged(SWITCHES[switch], tank), winged("", tank).fluid
 
 
-def check_switch(switch, height, speed, engines):
-    """Vertical acceleration, summed by hand over the parts that still take part."""
+@pytest.mark.slow
+@pytest.mark.parametrize("switch", SWITCHES)
+@pytest.mark.parametrize(("height", "speed"), [(-0.001, 0.0), (-2.0, -0.5)])
+def test_switches_of_single_modules(switch, height, speed):
+    """At rest half out of the water, deep at speed: summed by hand over what takes part."""
     robot, plain = switched(switch)
     qpos, qvel = at_rest(robot, 1, height)
     qvel[2] = speed
@@ -277,18 +266,9 @@ def check_switch(switch, height, speed, engines):
     found = accelerate(robot, qpos, qvel)[:, 0]
     assert found[2] == pytest.approx(force / (mass + carried), rel=1e-9)
     assert found[[0, 1, 3, 4, 5]] == pytest.approx(0.0, abs=1e-9)
-    speeds = [march(robot, 0.01, qpos, qvel, engine=engine)[2] for engine in engines]
-    assert speeds[-1] == pytest.approx(speeds[0], abs=1e-12)
     if speed == 0:
-        assert speeds[-1][0, 2, 0] / 0.005 == pytest.approx(force / (mass + carried), rel=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("switch", SWITCHES)
-def test_switches_of_single_modules(switch):
-    """Half out of the water at rest, and deep in it at speed."""
-    check_switch(switch, -0.001, 0.0, ("population",))
-    check_switch(switch, -2.0, -0.5, ("population",))
+        after = march(robot, 0.01, qpos, qvel)[2]
+        assert after[0, 2, 0] / 0.005 == pytest.approx(force / (mass + carried), rel=1e-9)
 
 
 def test_what_a_world_switches_off_stays_off():

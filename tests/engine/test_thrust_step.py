@@ -13,11 +13,9 @@ from laboratory import (
     at_rest,
     body,
     box_robot,
-    check_engines,
     face_drag,
     march,
     random_states,
-    read,
     world,
 )
 from mjx_revolve.body.module_types import Thruster
@@ -72,10 +70,9 @@ def test_a_trajectory_tells_the_command_behind_its_lag():
     assert found.qvel[1, 0] == pytest.approx(second, rel=1e-6)
 
 
-@pytest.mark.parametrize("ratio", [0.02, -0.02])
-def test_a_propeller_turns_its_robot_the_other_way(ratio):
+def test_a_propeller_turns_its_robot_the_other_way():
     """α = -c T / (I + A') about the axis, whichever way that points; a cube carries no spin."""
-    axis = np.array([1.0, 2.0, -2.0]) / 3
+    axis, ratio = np.array([1.0, 2.0, -2.0]) / 3, -0.02
     robot = driven(world(added_mass=True), gain=0.5, torque_ratio=ratio, axis=tuple(axis))
     qacc = accelerate(robot, *at_rest(robot, 1, -5.0), np.ones((1, 1)))[:, 0]
     inertia = NEUTRAL * 0.1**2 / 6 + RHO * robot.fluid.added_inertia[0, 0]
@@ -98,24 +95,14 @@ def test_out_of_the_water_there_is_nothing_to_push():
 
 def linear(morphology):
     """The robot with thrusters as stock MuJoCo can have them: linear in the command."""
-    modules = []
-    for module in morphology.modules:
-        parts = []
-        for part in module.kind.parts:
-            if part.thruster is not None:
-                part = replace(
-                    part,
-                    thruster=replace(
-                        part.thruster,
-                        curve="interpolated",
-                        gain=1.0,
-                        commands=(-1.0, 1.0),
-                        thrusts=(-0.4, 0.4),
-                    ),
-                )
-            parts.append(part)
-        modules.append(replace(module, kind=replace(module.kind, parts=tuple(parts))))
-    return replace(morphology, modules=tuple(modules))
+    line = {"curve": "interpolated", "gain": 1.0, "commands": (-1.0, 1.0), "thrusts": (-0.4, 0.4)}
+
+    def part(old):
+        return old if old.thruster is None else replace(old, thruster=replace(old.thruster, **line))
+
+    kinds = [replace(m.kind, parts=tuple(map(part, m.kind.parts))) for m in morphology.modules]
+    pairs = zip(morphology.modules, kinds, strict=True)
+    return replace(morphology, modules=tuple(replace(m, kind=kind) for m, kind in pairs))
 
 
 def test_a_linear_thruster_is_mujocos_filtered_actuator():
@@ -128,20 +115,6 @@ def test_a_linear_thruster_is_mujocos_filtered_actuator():
     acts = check_mujocos_steps(robot.mj_model, qpos, qvel, ctrl, (q, v), (1e-9, 1e-9))
     settled = np.clip(ctrl, -1, 1) * (1 - np.exp(-10))
     assert acts == pytest.approx(settled.T)
-
-
-@pytest.mark.slow
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("name", ["auv", "fin"])
-def test_the_two_engines_agree(name):
-    """Through the surface, in a current, thrusters and fins at work; half a second in float64."""
-    tail = "body: {type: Core, children: {0: {type: ActiveHinge, children: {1: {type: Fin}}}}}"
-    morphology = body("auv") if name == "auv" else read(tail)
-    robot = build_robot(morphology, world(**WATER, current=(0.2, -0.1, 0.05)))
-    qpos, qvel = random_states(robot, 4, speed=0.3)
-    qpos[2] = [-0.5, -0.05, 0.0, 0.1]
-    ctrl = np.random.default_rng(1).uniform(-1.2, 1.2, (robot.mj_model.nu, 4))
-    check_engines(robot, qpos, qvel, ctrl)
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import ROOT, body, make_track, refusal
+from laboratory import ELBOW, ROOT, body, make_track, refusal
 from mjx_revolve import InputError, make_fitness, make_mixed_fitness
 from mjx_revolve.episodes.config import load_config, make_config
 from mjx_revolve.episodes.measure_table import MEASURES, records_of
@@ -73,21 +73,11 @@ def test_speed_through_the_water_leaves_drift_out():
 def test_there_and_back_again():
     """2 m ahead, 1 m back, 2 m ahead, in 3 s; half a metre long, 2 N heavy, 3 J spent."""
     found = read(track([[0, 0, 1], [2, 0, 1], [1, 0, 1], [3, 0, 1]], interval=1.0))
-    assert found == pytest.approx(
-        {
-            "speed_bl_s": 2.0,
-            "speed_m_s": 1.0,
-            "path_speed_m_s": 5 / 3,
-            "displacement_m": 3.0,
-            "path_length_m": 5.0,
-            "straightness": 3 / 5,
-            "energy_j": 3.0,
-            "cost_of_transport": 3 / (2 * 3),
-            "depth_m": 2.0,
-            "depth_error_m": 1.0,
-        },
-        rel=1e-5,
-    )
+    assert found == pytest.approx({
+        "speed_bl_s": 2.0, "speed_m_s": 1.0, "path_speed_m_s": 5 / 3, "displacement_m": 3.0,
+        "path_length_m": 5.0, "straightness": 3 / 5, "energy_j": 3.0,
+        "cost_of_transport": 3 / (2 * 3), "depth_m": 2.0, "depth_error_m": 1.0,
+    }, rel=1e-5)  # fmt: skip
 
 
 def test_a_circle():
@@ -193,22 +183,10 @@ def test_names_are_read_written_and_checked(tmp_path):
         load_config(base, ["task.measures=tilt_rad"])
 
 
-ARM = """
-body:
-  type: Core
-  children:
-    1:
-      type: ActiveHinge
-      orientation: 90
-      children:
-        1: {type: FixedBrick, children: {1: {type: ActiveHinge, children: {1: {type: FixedBrick}}}}}
-"""
-
-
 @pytest.mark.slow
 def test_one_body_and_many_are_measured_alike(tmp_path, quick_compiles):
     """An arm of two hinges, its wave of 1 Hz, alone and beside a core without joints."""
-    (tmp_path / "arm.yaml").write_text(ARM)
+    (tmp_path / "arm.yaml").write_text(ELBOW)
     config = {
         "morphology": str(tmp_path / "arm.yaml"),
         "world": "lake",

@@ -18,20 +18,15 @@ from mjx_revolve.evolution.generations import choose_candidate
 TASK = {"type": "directed_swim", "duration": 0.6, "settle": 0.2, "trials": 1}
 
 
-@pytest.fixture
-def short(monkeypatch):
-    """Passports of seconds, not minutes, compiled in haste."""
-    monkeypatch.setattr(passport, "_MIDDLE", 0.8)
-    monkeypatch.setattr(passport, "_LONG", 1.2)
-    monkeypatch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
-
-
 @pytest.mark.long
-def test_what_only_drifts_fails_without_its_brain_alone(tmp_path, short):
+def test_what_only_drifts_fails_without_its_brain_alone(tmp_path, monkeypatch):
     """A robot that a current carries keeps its score in all other trials."""
+    monkeypatch.setattr(passport, "_MIDDLE", 0.8)  # seconds, not minutes, compiled in haste
+    monkeypatch.setattr(passport, "LONG", 1.2)
+    monkeypatch.setattr("mjx_revolve.numerics.xla.compiler_options", lambda fast=False: QUICK)
     settings = swimmer(tmp_path, OAR, TASK) | {"world": {"name": "lake", "current": [0.2, 0, 0]}}
     fitness = make_fitness(settings)
-    genes = np.zeros(fitness.num_genes)
+    genes = np.zeros(fitness.num_genes, np.float32)
     found = passport.make_passport(fitness, genes, 3)
     assert found.failed == ("brainless",) and "brainless" in found.mark
     checks = found.checks
@@ -48,16 +43,14 @@ def test_what_only_drifts_fails_without_its_brain_alone(tmp_path, short):
     lanes = passport._Lanes(np.arange(8), np.ones(8, int), None)
     key = jax.random.fold_in(jax.random.key(3), passport.PASSPORT_STREAM)
     varied = passport._all_lanes(passport._variants())
-    own = passport._scores(fitness, genes.astype(np.float32), key, lanes, False)[0.6]
-    wide = passport._scores(fitness, genes.astype(np.float32), key, varied, True)[0.6]
+    own = passport._scores(fitness, genes, key, lanes, False)[0.6]
+    wide = passport._scores(fitness, genes, key, varied, True)[0.6]
     np.testing.assert_allclose(wide[:8], own, atol=1e-5)
     np.testing.assert_allclose(wide[64 + 6 * 8 :], own, atol=1e-5)  # nothing to silence
     # What is swum for longer than the task lasts is not foretold.
     near = make_fitness(settings | {"task": TASK | {"horizon": 2.4}})
-    both = (
-        passport._scores(x, genes.astype(np.float32), key, lanes, True) for x in (fitness, near)
-    )
-    np.testing.assert_allclose(*(scores[1.2] for scores in both), rtol=1e-5)
+    both = (passport._scores(x, genes, key, lanes, True)[1.2] for x in (fitness, near))
+    np.testing.assert_allclose(*both, rtol=1e-5)
 
 
 @pytest.mark.parametrize(

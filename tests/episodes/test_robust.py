@@ -4,19 +4,13 @@ import jax
 import numpy as np
 import pytest
 
-from laboratory import swimmer
+from laboratory import ELBOW, swimmer
 from mjx_revolve import InputError, load_morphology, make_fitness, make_mixed_fitness
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.config import RobustConfig, dump_config, load_config, make_config
 
 KEY = jax.random.key(7)
 TASK = {"type": "speed", "duration": 1.0, "settle": 0.2, "trials": 2}
-ROBOT = """
-id: oars
-body: {id: core, type: Core, children: {
-  1: {id: left, type: ActiveHinge, orientation: 90, children: {1: {id: blade, type: FixedBrick}}},
-  2: {id: right, type: ActiveHinge, children: {1: {id: other, type: FixedBrick}}}}}
-"""
 WIDE = {"drag": 2.0, "added_mass": 1.5, "density": 1.01, "motor": 1.3}
 
 pytestmark = pytest.mark.usefixtures("quick_compiles")
@@ -24,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 @pytest.fixture(scope="module")
 def settings(tmp_path_factory):
-    return swimmer(tmp_path_factory.mktemp("robust"), ROBOT, TASK | {"robust": WIDE})
+    return swimmer(tmp_path_factory.mktemp("robust"), ELBOW, TASK | {"robust": WIDE})
 
 
 def test_what_may_stand_there(settings, tmp_path):

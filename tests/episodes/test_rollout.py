@@ -7,16 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import (
-    WATER,
-    body,
-    elbow_robot,
-    march,
-    oar_robot,
-    read,
-    refusal,
-    world,
-)
+from laboratory import WATER, body, elbow_robot, march, oar_robot, read, refusal, world
 from mjx_revolve.body.morphology import trim_neutral
 from mjx_revolve.control.controller import bind_genes
 from mjx_revolve.control.cpg import make_cpg
@@ -223,8 +214,7 @@ def test_wrong_genes(elbow):
 @pytest.mark.slow
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize(
-    ("engine", "first"),
-    [("population", "float32"), ("population", "float64"), ("mjx", "float64")],
+    ("engine", "first"), [("population", "float32"), ("population", "float64"), ("mjx", "float64")]
 )
 def test_both_precisions_in_one_process(engine, first):
     """The second one's program is what it would be alone.

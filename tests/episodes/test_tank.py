@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from laboratory import OAR, read
+from laboratory import ELBOW, OAR, read
 from mjx_revolve.episodes.fitness import make_mixed_fitness
 from mjx_revolve.episodes.tank import make_tank
 from mjx_revolve.inputs.errors import InputError
@@ -17,12 +17,6 @@ SENSORS = [
     # What keeps samples has to begin anew with each robot.
     {"type": "angle", "rate": 10, "noise": 0.05, "delay": 0.05},
 ]
-ELBOW = """
-body:
-  type: Core
-  children:
-    1: {type: ActiveHinge, children: {1: {type: FixedBrick, children: {1: {type: ActiveHinge}}}}}
-"""
 pytestmark = pytest.mark.usefixtures("quick_compiles")
 
 

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import _ELBOW, body, make_track, read
+from laboratory import ELBOW, body, make_track, read
 from mjx_revolve import InputError, make_fitness, make_mixed_fitness
 from mjx_revolve.body.edits import add_module
 from mjx_revolve.engine.plant import body_geometry
@@ -89,7 +89,7 @@ def test_the_beds_force_on_a_body_at_rest_is_what_the_water_leaves_of_its_weight
 @pytest.mark.long
 def test_joints_are_recorded_for_one_body_and_for_many(settings, tmp_path):
     """Held at their offsets, in the robot's own order, whatever the engine's."""
-    elbow = read(_ELBOW)
+    elbow = read(ELBOW)
     elbow.save(tmp_path / "elbow.yaml")
     config = settings("bending", morphology=str(tmp_path / "elbow.yaml"))
     one = make_fitness(config)

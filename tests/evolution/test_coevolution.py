@@ -102,60 +102,42 @@ def test_learning_improves_and_is_what_counts(folder):
         assert score[0] == pytest.approx(individual.score, abs=1e-6)
 
 
-def test_where_a_passport_is_required_the_living_are_candidates_too(folder, monkeypatch):
-    """What all elites fail, one of the other living passes, and becomes the champion.
-
-    Those whose joints do in one episode what no servo can are not tried.
-    """
+@pytest.mark.parametrize("lasts", ["joint_checks", "step_changes", "kept_shares"])
+def test_where_a_passport_is_required_the_living_are_candidates_too(folder, monkeypatch, lasts):
+    """What all elites fail the last of the other living passes, tried second: its joints alone do
+    what servos can, or its score alone holds at half the step, or for two minutes."""
     config, executor = start(folder, {"selection": {"type": "plus", "passport": "required"}})
     search, _ = run(config, executor)
     candidates = individual_search.list_candidates(search, True)
-    elites = individual_search.list_candidates(search, False)
-    others = [one.number for one in candidates[len(elites) :]]
+    elites, last, tried = individual_search.list_candidates(search, False), candidates[-1], []
+    others = {one.number for one in candidates[len(elites) :]}
     assert elites == search.elites and others
-    assert set(others) == {one.number for one in search.living} - {one.number for one in elites}
-    failing, tried, last = [one.genes for one in elites], [], candidates[-1]
+    assert others == {one.number for one in search.living} - {one.number for one in elites}
+    failing = [one.genes for one in elites]
 
     def judged(fitness, genes, seed):
         tried.append(genes)
         return Passport({"kept": Check("kept", float(genes not in failing), least=0.5)})
 
     def checked(robot, genes, settle):
-        yield "torque", Check("torque", float(np.array_equal(genes, last.genes)), least=0.5)
+        sound = lasts != "joint_checks" or np.array_equal(genes, last.genes)
+        yield "torque", Check("torque", float(sound), least=0.5)
+
+    def shares(name, good):
+        """The last one's score stays; those of others, too, of which this is not the test."""
+        stays = lambda body: name != lasts or body is last.body  # noqa: E731
+        return lambda _, bodies, *rest: np.array([good if stays(x) else 0.5 for x in bodies])
 
     monkeypatch.setattr(individual_search, "make_passport", judged)
     monkeypatch.setattr(type(executor.fitness.mixed), "replay", lambda _, robots, genes, key: genes)
     monkeypatch.setattr(individual_search, "joint_checks", checked)
+    monkeypatch.setattr(individual_search, "LONG", 2.0)  # what is swum is swum for two seconds
+    if lasts != "joint_checks":
+        monkeypatch.setattr(type(executor.fitness), "step_changes", shares("step_changes", 0.0))
+        monkeypatch.setattr(type(executor.fitness), "kept_shares", shares("kept_shares", 1.0))
     champion = BodyEvolution(config, executor).choose_champion(search)
     assert champion.individual == last.number and not champion.passport.failed
     assert len(tried) == 2 and tried[0] in failing
-
-
-@pytest.mark.parametrize("lasts", ["step_changes", "kept_shares"])
-def test_those_that_hold_their_score_are_tried_first(folder, monkeypatch, lasts):
-    """At half the step, and for two minutes."""
-    config, executor = start(folder, {"selection": {"type": "plus", "passport": "required"}})
-    search, _ = run(config, executor)
-    candidates = individual_search.list_candidates(search, True)
-    last, tried = candidates[-1], []
-
-    def judged(fitness, genes, seed):
-        tried.append(genes)
-        return Passport({"kept": Check("kept", float(genes == last.genes), least=0.5)})
-
-    def last_lasts(name):
-        """The last one's score stays; those of others, too, of which this is not the test."""
-        bad, good = (0.5, 0.0) if name == "step_changes" else (0.5, 1.0)
-        stays = lambda body: name != lasts or body is last.body  # noqa: E731
-        return lambda _, bodies, *rest: np.array([good if stays(x) else bad for x in bodies])
-
-    monkeypatch.setattr(individual_search, "make_passport", judged)
-    for name in ("step_changes", "kept_shares"):
-        monkeypatch.setattr(type(executor.fitness), name, last_lasts(name))
-    monkeypatch.setattr(type(executor.fitness.mixed), "replay", lambda _, robots, genes, key: genes)
-    monkeypatch.setattr(individual_search, "joint_checks", lambda *_: [])
-    champion = BodyEvolution(config, executor).choose_champion(search)
-    assert champion.individual == last.number and len(tried) == 2
 
 
 @pytest.mark.long

@@ -116,9 +116,8 @@ def test_mating(fitness, rules):
     # Robots of 2 s do not mate, nor does any where all slots are promised.
     young = {n: replace(m, born=8.0) for n, m in colony.members.items()}
     assert parents(mate(Colony(members=young), trajectory, rules)[0]) == []
-    full = replace(
-        colony, pending_births=(PendingBirth(99.0, mated.pending_births[0].parents),) * 3
-    )
+    promised = (PendingBirth(99.0, mated.pending_births[0].parents),) * 3
+    full = replace(colony, pending_births=promised)
     assert mate(full, trajectory, rules)[0].pending_births == full.pending_births
 
 
@@ -185,11 +184,8 @@ def test_births(fitness, rules):
     assert np.hypot(*child.position[:2]) <= 1.0 and child.position[2] == -1.0
     assert found.born == (child.individual,) and events[0]["parents"] == [0, 1]
     # Of two in a full clinic, none is born: the child waits, and no founder takes its number.
-    packed = rules._replace(
-        colony=rules.colony.model_copy(
-            update={"birth": rules.colony.birth.model_copy(update={"radius": 0.0})}
-        )
-    )
+    birth = rules.colony.birth.model_copy(update={"radius": 0.0})
+    packed = rules._replace(colony=rules.colony.model_copy(update={"birth": birth}))
     found, events = give_birth(colony, 10.0, packed, np.random.default_rng(1))
     assert found.pending_births == pending and found.next_number == 2 and not events
 
@@ -273,28 +269,20 @@ def test_it_goes_on_from_any_checkpoint_bit_for_bit(history, config):
 def test_what_cannot_be_a_colony_is_refused():
     bodies, colony = COLONY["bodies"], COLONY["colony"]
     for changes, said in (
-        (
-            {"bodies": None},
-            "bodies: expected how bodies evolve, as there is a colony; found nothing",
-        ),
-        (
-            {"bodies": bodies | {"learning": {"population_size": 4}}},
-            "bodies.learning: expected nothing, as in a colony",
-        ),
-        (
-            {"bodies": bodies | {"seeds": ["core"] * 6}},
-            "birth.initial: expected at least as many as bodies.seeds (6)",
-        ),
-        (
-            {"birth": {"initial": 9, "radius": 1.0}},
-            "birth.initial: expected at most evolution.population_size (8); found 9",
-        ),
+        ({"bodies": None},
+         "bodies: expected how bodies evolve, as there is a colony; found nothing"),
+        ({"bodies": bodies | {"learning": {"population_size": 4}}},
+         "bodies.learning: expected nothing, as in a colony"),
+        ({"bodies": bodies | {"seeds": ["core"] * 6}},
+         "birth.initial: expected at least as many as bodies.seeds (6)"),
+        ({"birth": {"initial": 9, "radius": 1.0}},
+         "birth.initial: expected at most evolution.population_size (8); found 9"),
         ({"look": 5.0}, "look: expected at most the interval (4 s); found 5"),
         ({"arena": {"edge": "wall"}}, "colony.arena.edge: expected"),
         ({"arena": {"size": 2.5, "depth": 1.0}}, "arena.depth: expected more than task.depth (1 m"),
         ({"life": {"window": 9.0, "max_age": 8.0}}, "window: expected at most life.max_age (8 s)"),
         ({"energy": {"chargers": [[0, 9, -1]]}}, "chargers[0]: expected a place in the arena"),
-    ):
+    ):  # fmt: skip
         data = COLONY | (changes if "bodies" in changes else {"colony": colony | changes})
         with pytest.raises(InputError, match=re.escape(said)):
             make_config(data, ROOT)

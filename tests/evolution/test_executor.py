@@ -193,16 +193,7 @@ def read_back(config):
     return Path(config.morphology).read_text(), code, world.name, grid
 
 
-@pytest.fixture
-def cache(tmp_path):
-    """JAX's compilation cache."""
-    before = jax.config.jax_compilation_cache_dir
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    yield
-    jax.config.update("jax_compilation_cache_dir", before)
-
-
-def test_one_compiles_and_the_others_wait(cache):
+def test_one_compiles_and_the_others_wait():
     entered, first_may_go = [], threading.Event()
     together = threading.Barrier(2, timeout=20)
 
@@ -350,7 +341,6 @@ def test_workers_of_another_program_score_nothing(tmp_path, caplog):
 SCRIPT = """
 import sys
 import toys
-from laboratory import OAR
 from mjx_revolve import evolve
 from mjx_revolve.inputs.commands import run_command
 
@@ -416,10 +406,8 @@ def test_a_robot_does_not_depend_on_its_workers(tmp_path):
     found = []
     for count in (2, 1):
         with make_executor(config, count) as executor:
-            genes = (
-                np.random.default_rng(0).normal(size=(10, executor.num_genes)).astype(np.float32)
-            )
-            found.append(executor.evaluate(genes, KEY))
+            genes = np.random.default_rng(0).normal(size=(10, executor.num_genes))
+            found.append(executor.evaluate(np.float32(genes), KEY))
     (scores, measures), (alone, alone_measures) = found
     assert scores.tobytes() == alone.tobytes() and np.ptp(scores) > 0
     for name, values in measures.items():

@@ -91,23 +91,15 @@ def test_all_failed_and_penalties():
 
 
 QUICK = ("CMA_ES", "OpenES", "SNES", "PGPE")
+# These search at random, or with a step that ignores what they find.
+WEAK = ("RandomSearch", "SimpleGA", "DiffusionEvolution", "GESMR_GA", "iAMaLGaM_Univariate")
+OTHERS = sorted(set(STRATEGIES) - {find_strategy(name) for name in QUICK})
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", QUICK)
-def test_strategies_reach_the_optimum(name):
-    check_optimum(name)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(set(STRATEGIES) - {find_strategy(n) for n in QUICK}))
-def test_all_other_strategies_get_nearer(name):
-    # These search at random, or with a step that ignores what they find.
-    weak = ("RandomSearch", "SimpleGA", "DiffusionEvolution", "GESMR_GA", "iAMaLGaM_Univariate")
-    check_optimum(name, within=1.0 if name in weak else 0.2)
-
-
-def check_optimum(name, within=0.05):
+@pytest.mark.parametrize("name", [*QUICK, *OTHERS])
+def test_strategies_reach_the_optimum_or_get_nearer(name):
+    within = 0.05 if name in QUICK else 1.0 if name in WEAK else 0.2
     fitness = Quadratic()
     start = float(np.sum(fitness.target**2))  # 2.5
     population = 8 if name == "LM_MA_ES" else 16 if name in QUICK else 32

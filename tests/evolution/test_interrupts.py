@@ -141,8 +141,7 @@ def test_two_signals_at_once_save_even_inside_a_compiled_program(folder, monkeyp
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("command", "module"),
-    [("evolve", "argparse"), ("viewer", "numpy._core.multiarray")],
+    ("command", "module"), [("evolve", "argparse"), ("viewer", "numpy._core.multiarray")]
 )
 def test_ctrl_c_while_importing_is_one_line(folder, command, module):
     process = subprocess.Popen(

@@ -96,33 +96,28 @@ def test_order_does_not_depend_on_where_individuals_stand(objectives):
         assert (ids[shuffled][best_first(values[shuffled], ids[shuffled])] == expected).all()
 
 
-def test_plus_keeps_the_best_of_all():
-    found = candidates([5, 1, 3, 4, 0, 9], children=3)
-    assert survivors("plus", found, 3) == [5, 0, 3]
+@pytest.mark.parametrize(("scheme", "scores", "children", "mu", "kept", "settings"), [
+    ("plus", [5, 1, 3, 4, 0, 9], 3, 3, [5, 0, 3], {}),
     # A child that is as good as a parent stays behind it.
-    assert survivors("plus", candidates([5, 3, 3, 5], children=2), 2) == [0, 3]
-    assert survivors("plus", candidates([5, 3, 4, 3], children=2), 3) == [0, 2, 1]
-
-
-def test_comma_keeps_the_best_of_the_children():
-    found = candidates([5, 9, 3, 4, 0, 1], children=4)
-    assert survivors("comma", found, 2) == [3, 2]
-    assert survivors("comma", found, 6) == [3, 2, 5, 4]
-
-
-def test_generational_keeps_children_and_some_of_the_parents():
-    found = candidates([5, 9, 8, 4, 0, 1], children=3)
-    assert survivors("generational", found, 3, elites=1) == [1, 3, 5]
-    assert survivors("generational", found, 3, elites=2) == [1, 2, 3]
-    assert survivors("generational", found, 3, elites=0) == [3, 5, 4]
+    ("plus", [5, 3, 3, 5], 2, 2, [0, 3], {}), ("plus", [5, 3, 4, 3], 2, 3, [0, 2, 1], {}),
+    ("comma", [5, 9, 3, 4, 0, 1], 4, 2, [3, 2], {}),
+    ("comma", [5, 9, 3, 4, 0, 1], 4, 6, [3, 2, 5, 4], {}),
+    ("generational", [5, 9, 8, 4, 0, 1], 3, 3, [1, 3, 5], {"elites": 1}),
+    ("generational", [5, 9, 8, 4, 0, 1], 3, 3, [1, 2, 3], {"elites": 2}),
+    ("generational", [5, 9, 8, 4, 0, 1], 3, 3, [3, 5, 4], {"elites": 0}),
     # An elite stays even if all children are better, and stands where it belongs.
-    assert survivors("generational", candidates([1, 2, 7, 8], children=2), 2, elites=1) == [3, 1]
+    ("generational", [1, 2, 7, 8], 2, 2, [3, 1], {"elites": 1}),
+    # 2 takes the place of 1, 4 that of 2, and 3 is not better than 3.
+    ("steady", [5, 1, 3, 2, 4, 3], 3, 3, [0, 4, 2], {}),
+    ("nsga2", FIELD, 3, 3, [0, 2, 1], {}), ("nsga2", FIELD, 3, 4, [0, 2, 1, 3], {}),
+    # A front of five for four places: (1, 9) has the nearest neighbours.
+    ("nsga2", [[0, 10], [1, 9], [2, 8], [6, 4], [10, 0]], 0, 4, [0, 4, 3, 2], {}),
+])  # fmt: skip
+def test_survivors_by_hand(scheme, scores, children, mu, kept, settings):
+    assert survivors(scheme, candidates(scores, children=children), mu, **settings) == kept
 
 
 def test_steady_is_a_child_after_the_other_in_the_place_of_the_worst():
-    found = candidates([5, 1, 3, 2, 4, 3], children=3)
-    # 2 takes the place of 1, 4 that of 2, and 3 is not better than 3.
-    assert survivors("steady", found, 3) == [0, 4, 2]
     rng = np.random.default_rng(2)
     for _ in range(50):
         scores, mu = rng.integers(0, 6, 12).astype(float), int(rng.integers(1, 6))
@@ -135,14 +130,6 @@ def test_steady_is_a_child_after_the_other_in_the_place_of_the_worst():
             if values[child] > values[worst]:
                 kept[kept.index(worst)] = child
         assert survivors("steady", found, mu) == sorted(kept, key=lambda i: (-values[i], i))
-
-
-def test_nsga2_fills_up_front_by_front_and_the_last_one_by_crowding():
-    assert survivors("nsga2", candidates(FIELD, children=3), 3) == [0, 2, 1]
-    assert survivors("nsga2", candidates(FIELD, children=3), 4) == [0, 2, 1, 3]
-    # A front of five for four places: (1, 9) has the nearest neighbours.
-    line = [[0, 10], [1, 9], [2, 8], [6, 4], [10, 0]]
-    assert survivors("nsga2", candidates(line), 4) == [0, 4, 3, 2]
 
 
 def test_random_keeps_the_best_and_map_elites_all():

@@ -11,7 +11,7 @@ import yaml
 
 from laboratory import OURS, ROOT, WILD, refusal, tree
 from mjx_revolve.body.catalogue import MODULES, load_modules
-from mjx_revolve.body.morphology import load_morphology, make_morphology, save_morphology
+from mjx_revolve.body.morphology import load_morphology, make_morphology
 from mjx_revolve.body.placement import find_overlaps
 from mjx_revolve.episodes import bodies_config
 from mjx_revolve.genotypes.genotype import TRIES, Space, accept_all, make_space
@@ -96,16 +96,6 @@ def test_bodies_are_valid_and_in_the_space(families, name, space):
         assert len({m.name for m in body.modules}) == body.num_modules
         # Laid out as a file's would be, in the same order.
         assert make_morphology(body.to_mapping()) == body
-
-
-@kinds
-def test_bodies_come_back_from_yaml(families, tmp_path, name):
-    genotype, *generations = families(name, SPACES["all modules"])
-    for generation in generations:
-        for genome in generation[:10]:
-            body = genotype.develop(genome)
-            save_morphology(body, tmp_path / "body.yaml")
-            assert load_morphology(tmp_path / "body.yaml") == body
 
 
 @pytest.mark.slow

@@ -26,8 +26,7 @@ from mjx_revolve.inputs.packages import REQUIREMENTS, check_mujoco, check_packag
 
 
 @pytest.mark.parametrize(
-    ("name", "words"),
-    [("evolve", "--resume DIR"), ("viewer", "--out FILE.html")],
+    ("name", "words"), [("evolve", "--resume DIR"), ("viewer", "--out FILE.html")]
 )
 def test_help_loads_nothing_heavy(name, words):
     heavy = {"jax", "mujoco", "matplotlib", "scipy"}

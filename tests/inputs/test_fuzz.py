@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 import malformed
 import toys
-from laboratory import _ARM, _ELBOW, ROOT
+from laboratory import ARM, ELBOW, ROOT
 from malformed import (
     VALUES,
     Mutant,
@@ -48,7 +48,7 @@ from mjx_revolve.water.world import load_world
 def folder(tmp_path_factory):
     """An own folder, current, with a robot in it."""
     path = tmp_path_factory.mktemp("fuzz")
-    (path / "elbow.yaml").write_text(_ELBOW)
+    (path / "elbow.yaml").write_text(ELBOW)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(path)
         yield path
@@ -77,7 +77,7 @@ body:
     3: {type: FixedBrick, params: {mass: "0.02;", volume: 1e-5, buoyancy: mask, added_mass: off}}
 brain: {type: cpg, period: [1, 2.5, null]}
 """
-ROBOTS = (_ARM, _ELBOW, ROBOT)
+ROBOTS = (ARM, ELBOW, ROBOT)
 # What a brain is, others know; so do those who write into `params` what we do not.
 FREE = re.compile(r"^brain\b|\bparams\.foo$")
 
@@ -306,7 +306,7 @@ def whole(tmp_path_factory):
     path = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(path)
-        (path / "elbow.yaml").write_text(_ELBOW)
+        (path / "elbow.yaml").write_text(ELBOW)
         config = {
             "morphology": "elbow.yaml", "world": "lake", "task": {"type": "speed"},
             "evolution": {"strategy": "SNES", "generations": 3, "checkpoint_every": 1,

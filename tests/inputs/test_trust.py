@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import toys
-from laboratory import _ELBOW as ELBOW
+from laboratory import ELBOW
 from mjx_revolve import evolve, export, replay, report, viewer
 from mjx_revolve.episodes.config import load_config
 from mjx_revolve.evolution import run_folder as runs

@@ -3,7 +3,6 @@
 import io
 import math
 from dataclasses import replace
-from functools import lru_cache
 
 import mujoco
 import numpy as np
@@ -162,31 +161,21 @@ def test_stage_stands_as_the_robot_does(name):
         assert near.max() < 1e-5
 
 
-@lru_cache
-def shader_of(world, above):
-    return make_shader(world, (32, 24), 1.0, above)
-
-
-def shade(world, above, depth, color=(200, 60, 40), height=1.0, pitch=0.0, time=0.0):
-    """A picture of one colour, all at one depth, by a camera at a height above the surface."""
-    shader = shader_of(world, above)
-    picture = np.empty((24, 32, 3), np.uint8)
-    picture[:] = color
-    axes = np.array([[1, 0, 0], [0, -math.sin(pitch), math.cos(pitch)],
-                     [0, math.cos(pitch), math.sin(pitch)]], np.float32)  # fmt: skip
-    water = Water(np.float32(0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), np.float32(time))
-    depths, place = np.full((24, 32), depth, np.float32), np.float32([0, 0, height])
-    return np.asarray(shader(picture, depths, place, axes, water))
-
-
 def test_waves_move_the_surface_in_time():
-    calm = load_world("lake")
-    rough = load_world("lake", waves=[{"amplitude": 0.05, "wavelength": 1.0}])
-    plain = tuple(round(255 * c) for c in BACKGROUND)
-    look = {"color": plain, "height": -0.3, "pitch": 0.6}
-    first, later = (shade(rough, False, np.inf, time=t, **look).astype(int) for t in (0.0, 0.4))
-    assert np.abs(first - later).max() > 20
-    assert np.abs(first - shade(calm, False, np.inf, **look).astype(int)).max() > 20
+    up, ahead = math.cos(0.6), math.sin(0.6)
+    axes = np.float32([[1, 0, 0], [0, -ahead, up], [0, up, ahead]])
+    picture = np.full((24, 32, 3), [round(255 * c) for c in BACKGROUND], np.uint8)
+    far, place = np.full((24, 32), np.inf, np.float32), np.float32([0, 0, -0.3])
+    waves = {"waves": [{"amplitude": 0.05, "wavelength": 1.0}]}
+    calm, rough = (make_shader(load_world("lake", **w), (32, 24), 1.0, False) for w in ({}, waves))
+
+    def shade(shader, time):
+        water = Water(np.float32(0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), np.float32(time))
+        return np.asarray(shader(picture, far, place, axes, water)).astype(int)
+
+    first = shade(rough, 0.0)
+    assert np.abs(first - shade(rough, 0.4)).max() > 20
+    assert np.abs(first - shade(calm, 0.0)).max() > 20
 
 
 def test_frames_are_evenly_spaced_and_between_the_rows(episode):
@@ -371,22 +360,13 @@ def test_the_command_films_a_colony(av, colony, way, tmp_path, monkeypatch, caps
 
 @pytest.fixture
 def command(episode, monkeypatch):
-    """Runs the command on the made-up episode."""
-    import mjx_revolve.episodes.champion
-    import mjx_revolve.episodes.early_checks
-    import mjx_revolve.view.viewer
-
-    def load(path, world="lake", duration=None, seed=None, individual=None, modules=None):
-        return episode
-
-    monkeypatch.setattr(mjx_revolve.episodes.champion, "load_episode", load)
-    # Its files are made up, too.
-    monkeypatch.setattr(mjx_revolve.episodes.early_checks, "check_episode_files", lambda _: None)
-
-    def write(episode, path):
-        write_atomic(path, episode.title.encode())
-
-    monkeypatch.setattr(mjx_revolve.view.viewer, "write_viewer", write)
+    """Runs the command on the made-up episode, of files that are made up, too."""
+    for name, stand_in in (
+        ("episodes.champion.load_episode", lambda *given, **more: episode),
+        ("episodes.early_checks.check_episode_files", lambda _: None),
+        ("view.viewer.write_viewer", lambda swim, path: write_atomic(path, swim.title.encode())),
+    ):
+        monkeypatch.setattr(f"mjx_revolve.{name}", stand_in)
     return lambda *words: run_command(replay.main, list(words))
 
 

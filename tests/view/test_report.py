@@ -8,8 +8,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from laboratory import _ELBOW as ELBOW
-from laboratory import check_error
+from laboratory import ELBOW, check_error
 from mjx_revolve import evolve, inspect, passport, report
 from mjx_revolve.episodes.config import load_config, make_config
 from mjx_revolve.episodes.fitness import make_fitness
@@ -139,16 +138,6 @@ def test_seeds_are_grouped_and_configurations_told_apart(lab, tmp_path):
     assert (alone.name, alone.task, alone.unit) == ("swim", "speed", "body lengths/s")
 
 
-@pytest.mark.slow
-def test_of_runs_that_are_not_finished_the_furthest_counts(lab, tmp_path):
-    config = make_config(lab["config"].model_dump(), "/", ["evolution.generations=9"], "swim.yaml")
-    for seed, generations in enumerate((9, 4, 7)):
-        make_run(tmp_path / f"{seed}", config, lab["fitness"], seed, generations, finished=False)
-    (group,) = group_runs([read_run(tmp_path / f"{seed}") for seed in range(3)])
-    assert group.scores() == []
-    assert group.best().seed == 0  # the furthest, where nothing was judged
-
-
 def test_seeds_with_the_same_files_are_one_group(lab, tmp_path):
     (tmp_path / "fit.yaml").write_text("modules: {all: {factors: {drag: 1.1}}}")
     overrides = [f"coefficients={tmp_path}/fit.yaml"]
@@ -160,12 +149,15 @@ def test_seeds_with_the_same_files_are_one_group(lab, tmp_path):
     assert len(group.records) == 2
 
 
-def test_the_best_run_is_the_best_judged_one(lab, tmp_path):
-    for seed, (score, finished) in enumerate(((0.2, True), (0.3, True), (0.9, False))):
-        make_run(tmp_path / f"{seed}", lab["config"], lab["fitness"], seed, 6, finished, score)
+@pytest.mark.parametrize(("made", "best", "scores"), [
+    (((0.2, 6, True), (0.3, 6, True), (0.9, 6, False)), 1, [0.2, 0.3]),
+    (((None, 6, False), (None, 2, False), (None, 4, False)), 0, []),  # the furthest
+])  # fmt: skip
+def test_the_best_run_is_the_best_judged_one(lab, tmp_path, made, best, scores):
+    for seed, (score, count, finished) in enumerate(made):
+        make_run(tmp_path / f"{seed}", lab["config"], lab["fitness"], seed, count, finished, score)
     (group,) = group_runs([read_run(tmp_path / f"{seed}") for seed in range(3)])
-    assert group.best().seed == 1
-    assert group.scores() == [0.2, 0.3]
+    assert group.best().seed == best and group.scores() == scores
 
 
 def cut(path, share=0.5):

@@ -140,8 +140,7 @@ def test_currents_are_drawn_and_speeds_told_apart(small):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("target", "words"),
-    [((0.4, 0.05, -1.0), ""), ((5.3, 0.0, -1.0), ", 5 m on"), (None, None)],
+    ("target", "words"), [((0.4, 0.05, -1.0), ""), ((5.3, 0.0, -1.0), ", 5 m on"), (None, None)]
 )
 @pytest.mark.parametrize("name", ["target", "pursuer"])
 def test_targets_are_drawn_or_pointed_at(small, name, target, words):

@@ -154,31 +154,6 @@ def test_force_moment_and_gradients_are_continuous_through_the_surface(name):
             assert np.all(fine < 0.7 * coarse + 1e-9), tilt
 
 
-def potential(state, half):
-    """W by the corners of the box: the textbook's sum, for edges far from level only."""
-    a = jnp.abs(jnp.stack(state[1:]) if isinstance(state, tuple) else state[1:]) * half
-    total = 0.0
-    for signs in itertools.product((-1, 1), repeat=3):
-        total += np.prod(signs) * jnp.maximum(0.0, state[0] + a @ np.array(signs, float)) ** 4
-    return total / (192 * a.prod())
-
-
-@pytest.mark.parametrize("name", ["cube", "ActiveHinge-frame", "TouchSensor-sensor"])
-def test_share_and_moment_are_the_slopes_of_the_mean_depth(name):
-    """Share = ∂W/∂d, moment = -∂W/∂n, and so the force and torque of the energy ρgV W."""
-    half, n = BOXES[name], 200
-    up = attitudes(8 * n, 7)
-    # The textbook's sum loses digits with each edge that nears level.
-    up = up[np.abs(up).min(1) > 0.15][:n]
-    depth = np.random.default_rng(3).uniform(-0.95, 0.95, len(up)) * (np.abs(up) @ half)
-    share, moment = cut(up, depth, half)
-    with jax.enable_x64(True):
-        slopes = jax.jit(jax.vmap(jax.grad(lambda s: potential(s, half))))
-        slopes = np.asarray(slopes(jnp.column_stack([depth, up])))
-    assert share == pytest.approx(slopes[:, 0], abs=1e-9)
-    assert moment == pytest.approx(-slopes[:, 1:], abs=1e-9 * half.max())
-
-
 LEVEL, EDGE, CORNER = (0.0, 0.0, 1.0), (0.0, -(0.5**0.5), 0.5**0.5), (3**-0.5,) * 3
 STATES = {
     # up, depth over the height from centre to the top

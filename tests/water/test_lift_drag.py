@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from laboratory import accelerate, at_rest, box_robot, check_refused, face_drag, march, world
 from mjx_revolve.water.lift_drag import (
@@ -43,15 +44,6 @@ def flow(alpha, speed=1.0, sideways=0.0, forward=X, upward=Z):
     side = np.cross(forward, upward)
     ahead, below = np.outer(forward, np.cos(alpha)), np.outer(upward, np.sin(alpha))
     return speed * (ahead - below) + np.outer(side, sideways * np.ones_like(alpha))
-
-
-def turn(rotation, *vectors):
-    return [rotation @ x for x in vectors]
-
-
-def rotation_of(seed):
-    q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
-    return q * np.sign(np.linalg.det(q))
 
 
 def unit(x):
@@ -105,7 +97,7 @@ def test_against_gz_sim_over_random_flows(plate):
     """Any direction of flow, any attitude of the plate, speeds from 0.1 to 10 m/s."""
     p, draw = PLATES[plate], np.random.default_rng(1)
     v = draw.normal(size=(3, 300)) * 10 ** draw.uniform(-1, 1, 300)
-    forward, upward = turn(rotation_of(5), X, Z)
+    forward, upward = Rotation.random(random_state=5).as_matrix()[:, [0, 2]].T
     v[:, :100] = flow(np.linspace(-3.1, 3.1, 100), forward=forward, upward=upward)
     found = wrench(v, p, forward, upward)
     expected = np.array([gazebo(x, p, forward, upward, AREA) for x in v.T]).transpose(1, 2, 0)
@@ -142,15 +134,6 @@ def test_named_departures():
     assert np.linalg.norm(gazebo(X, along, X, Z, AREA)[0]) == pytest.approx(
         abs(broadside[2]), rel=1e-6
     )
-
-
-@pytest.mark.parametrize("plate", PLATES)
-def test_never_adds_energy(plate):
-    """Lift stands across the flow in the plate's plane, drag against it."""
-    v = np.random.default_rng(8).normal(size=(3, 5000))
-    power = (wrench(v, PLATES[plate])[0] * v).sum(0)
-    assert np.all(power <= 1e-12 * RHO * np.linalg.norm(v, axis=0) ** 3)
-    assert power.min() < 0
 
 
 def jacobian(v, p):
@@ -317,18 +300,12 @@ FLAT = LiftDrag(
 )
 
 
-def tossed(mass, **fields):
-    """Speeds `[n, 32]` of a plate at 5 ms, begun at about 5 m/s in any direction."""
-    robot = box_robot(SIZE, mass, world(drag="faces", **fields), lift_drag=FLAT)
-    qpos, qvel = at_rest(robot, 32, -50.0)
-    qvel[:3] = np.random.default_rng(13).normal(size=(3, 32)) * 3.0
-    _, _, after, _ = march(robot, 1.0, qpos, qvel)
-    carried = RHO * robot.fluid.carried_mass[0].max()
-    return np.linalg.norm(np.concatenate([qvel[None, :3], after[:, :3]]), axis=1), carried
-
-
 @pytest.mark.parametrize("mass", [0.001, 0.1])
 def test_stiff_fin_does_not_blow_up(mass):
-    """dt ρ A |v| cla / m is 700 for a fin of 1 g; explicit steps bear 2."""
-    speed, _ = tossed(mass)
+    """dt ρ A |v| cla / m is 700 for a fin of 1 g at 5 m/s; explicit steps bear 2."""
+    robot = box_robot(SIZE, mass, world(drag="faces"), lift_drag=FLAT)
+    qpos, qvel = at_rest(robot, 32, -50.0)
+    qvel[:3] = np.random.default_rng(13).normal(size=(3, 32)) * 3.0
+    after = march(robot, 1.0, qpos, qvel)[2]
+    speed = np.linalg.norm(np.concatenate([qvel[None, :3], after[:, :3]]), axis=1)
     assert np.all(np.diff(speed, axis=0) < 1e-9)

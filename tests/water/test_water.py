@@ -93,6 +93,13 @@ def test_all_motion_adds_up():
     assert np.allclose(velocity, current + sum(v for v, _ in alone), rtol=0, atol=1e-14)
     assert np.allclose(push, acceleration + alone[2][1], rtol=0, atol=1e-13)
 
+    def all_of(sea):
+        world = make_world(waves=sea, water_depth=1.5)
+        return *moving(world, place, 2.0), *top(world, place, 2.0)
+
+    for found, *waves in zip(all_of(SEA), *map(all_of, SEA), strict=True):
+        assert np.allclose(found, sum(waves), rtol=0, atol=1e-13)
+
 
 @pytest.mark.parametrize("relative", [1e-3, 0.5, 3.0, 30.0])
 def test_dispersion(relative):
@@ -153,23 +160,6 @@ def test_orbital_velocity_is_the_gradient_of_the_textbooks_potential(wave, depth
     d = 1e-5
     change = (moving(world, place, time + d)[0] - moving(world, place, time - d)[0]) / (2 * d)
     assert np.allclose(acceleration, change, rtol=0, atol=1e-8)
-
-
-@pytest.mark.parametrize("depth", DEPTHS)
-def test_conditions_at_the_surface_and_at_the_bed(depth):
-    """∂η/∂t = w and Du/Dt = -g ∇η at the still surface, to first order; w = 0 at the bed."""
-    world, place, d = make_world(waves=SEA, water_depth=depth), places(), 1e-5
-    place[2] = 0
-    velocity, acceleration = moving(world, place, 0.6)
-    rise = (top(world, place, 0.6 + d)[0] - top(world, place, 0.6 - d)[0]) / (2 * d)
-    assert np.allclose(velocity[2], rise, rtol=0, atol=1e-9)
-    assert np.allclose(acceleration[:2], -G * top(world, place, 0.6)[1], rtol=0, atol=1e-12)
-    if depth is not None:
-        place[2] = -depth
-        velocity, acceleration = moving(world, place, 0.6)
-        assert not velocity[2].any()
-        assert not acceleration[2].any()
-        assert np.abs(velocity[:2]).max() > 1e-3
 
 
 def test_above_the_surface_and_below_the_bed():

@@ -141,6 +141,7 @@ WRONG = [
         {"lift_drag": {"cl": 1}},
         f"lift_drag.cl: expected one of {KEYS} keys; {UNKNOWN} lift_drag.cla?",
     ),
+    ({"bed": {"contact": "MJX"}}, "bed.contact: expected one of penalty, mjx; found 'MJX'"),
     ({"gust": {"std": [1, -2, 0]}}, "gust.std.1: expected a number >= 0 [m/s]; found -2"),
     ({"waves": {"amplitude": 0.1}}, "waves.0: expected either wavelength or period; found none"),
     (
