@@ -18,6 +18,7 @@ from mjx_revolve.fitting.estimate import (
     prior_matrix,
 )
 from mjx_revolve.fitting.parameters import Parameter
+from mjx_revolve.fitting.poses import rest_height
 from mjx_revolve.fitting.problem import NOISE, FitProblem, FitSettings, make_problem
 from mjx_revolve.fitting.recording import RobotRecording, TimeSeries
 from mjx_revolve.inputs.errors import InputError
@@ -120,7 +121,8 @@ def list_motions(robot: Robot, settings: FitSettings) -> list[PlannedMotion]:
     hinges = [modules[k].name for k in robot.morphology.hinges]
     parts = {modules[k].name: modules[k].kind.parts[i] for k, i in robot.morphology.thrusters}
     jets = {n: part.thruster for n, part in parts.items() if part.thruster is not None}
-    still = {n: TimeSeries(time, 0 * time) for n in ("x", "y", "z", "yaw", "roll", "pitch")}
+    still = {n: TimeSeries(time, 0 * time) for n in ("x", "y", "yaw", "roll", "pitch")}
+    still["z"] = TimeSeries(time, 0 * time + rest_height(robot))
     found: list[PlannedMotion] = []
 
     def add(words: str, commands: dict[str, np.ndarray], velocity: Sequence[float] = (0,) * 6,

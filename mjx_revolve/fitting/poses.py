@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from mjx_revolve.engine.kinematics import body_poses
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.fitting.recording import MarkedPoint
+from mjx_revolve.fitting.recording import GAP, MarkedPoint
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.water.bed import bed_height
 
 # Marks fit a robot if they are so far off at most, in lengths of the robot, and are swapped or
 # mirrored if that makes them fit so many times better. Choices.
@@ -49,6 +50,46 @@ class MarkPoints:
         """`[n, marks, 3]` in the core's frame, of `[n, hinges]` angles [rad]."""
         still = np.tile(self.robot.qpos0[:7], (len(angles), 1))
         return self.at(np.concatenate([still, angles], 1))
+
+
+def gap(time: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Whether times lie in a gap of a signal, farther from its rows than rows usually do.
+
+    Args:
+        time: `[n]` of the rows, rising [s].
+        at: `[m]` [s].
+
+    Returns:
+        `[m]`; none of them where there are fewer than two rows.
+    """
+    if len(time) < 2:
+        return np.zeros(np.shape(at), bool)
+    k = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
+    away = np.minimum(np.abs(at - time[k - 1]), np.abs(at - time[k]))
+    return away > GAP * float(np.median(np.diff(time)))
+
+
+def joined_marks(time: np.ndarray, seen: np.ndarray, dims: int) -> np.ndarray:
+    """Marks that are seen at times of their own, between their frames, all at the same times.
+
+    Args:
+        time: `[n]` [s].
+        seen: `[n, marks, 3]` world frame, NaN where not seen [m].
+        dims: how many axes are seen.
+
+    Returns:
+        The same; what lies in a gap stays NaN.
+    """
+    found = seen.copy()
+    for m in range(seen.shape[1]):
+        known = np.isfinite(seen[:, m, :dims]).all(1)
+        if known.sum() < 2:
+            continue
+        own = time[known]
+        between = ~known & ~gap(own, time) & (time > own[0]) & (time < own[-1])
+        for axis in range(dims):
+            found[between, m, axis] = np.interp(time[between], own, seen[known, m, axis])
+    return found
 
 
 def fit_rigid(
@@ -105,6 +146,10 @@ def check_marks(
         return
     dims = 2 if planar else 3
     known = np.isfinite(seen[..., :dims]).all(-1, keepdims=True)
+    several = known[..., 0].sum(1) > 1
+    if not several.any():
+        raise InputError("marks", "two or more of them at a time", "never two")
+    model, seen, known, time = model[several], seen[several], known[several], time[several]
     spread = []
     for points in (seen, model):
         variance = np.nanvar(np.where(known, points[..., :dims], np.nan), axis=1).sum(-1)
@@ -187,11 +232,15 @@ def smooth(
 
 
 def rest_height(robot: Robot) -> float:
-    """Height of the core at which a level robot floats; 1 m down for one that does not [m]."""
+    """Height of the core where a level robot floats; else 1 m down, or half way to the bed [m]."""
     table, layout, world = robot.fluid, robot.assembly.layout, robot.world
     carried = world.density * table.volume.sum()
     if robot.morphology.mass > 0.995 * carried:
-        return world.surface_height - 1.0
+        room = np.inf
+        if world.bed is not None:
+            origin = np.zeros(1)
+            room = world.surface_height - float(bed_height(world.bed, origin, origin)[0])
+        return world.surface_height - min(1.0, room / 2)
     reach = np.sum(np.abs(layout.rotation[:, 2]) * table.half_size, 1)
     low, high = -1.0, 1.0
     for _ in range(50):

@@ -28,7 +28,15 @@ from mjx_revolve.fitting.parameters import (
     split_free,
     with_values,
 )
-from mjx_revolve.fitting.poses import MarkPoints, check_marks, fit_rigid, rest_height, smooth
+from mjx_revolve.fitting.poses import (
+    MarkPoints,
+    check_marks,
+    fit_rigid,
+    gap,
+    joined_marks,
+    rest_height,
+    smooth,
+)
 from mjx_revolve.fitting.recording import RobotRecording
 from mjx_revolve.fitting.simulation import ROOT, Drive, simulate_windows
 from mjx_revolve.inputs.errors import InputError
@@ -376,6 +384,11 @@ def make_problem(
         many = 1 if whole else max(1, int(usual[r] / piece / _PARTS + 0.25))
         resets[: many * _PARTS : _PARTS, r] = True
         short[: 1 if whole else max(1, int(usual[r] / piece + 0.25)), r] = True
+        if view.quat is not None:  # nor in a gap of it
+            seen = np.isfinite(view.quat).all(1) & np.isfinite(view.position[:, :2]).all(1)
+            lost = gap(view.time[seen], begin[r] + piece * np.arange(windows))
+            lost[0] = False
+            resets[lost, r] = short[lost, r] = False
     at = begin + piece * np.arange(windows)[:, None]
     starts = [view.starts(t) for view, t in zip(views, at.T, strict=True)]
     roots, spread = (np.stack([s[k] for s in starts], -1) for k in range(2))
@@ -445,11 +458,15 @@ def _prescribed(
     """Hinges that move as measured."""
     if servos_free:
         for r in recordings:
-            kinds = {n.partition(".")[0] for n in r.signals}
-            if "angle" in kinds and "command" not in kinds:
+            given = r.signals.keys()
+            lacking = [
+                h for h in hinges if {f"angle.{h}", f"command.{h}"} & given == {f"angle.{h}"}
+            ]
+            if lacking:
                 raise InputError(
-                    r.name, "the servos' commands (command.MODULE), as they are free", "none"
-                )
+                    r.name, "the servos' commands (command.MODULE), as they are free",
+                    f"none of {', '.join(lacking)}",
+                )  # fmt: skip
         return set()
     found = [{h for h in hinges if f"angle.{h}" in r.signals} for r in recordings]
     for r, some in zip(recordings, found, strict=True):
@@ -531,7 +548,7 @@ class _View:
         self.seen = seen.reshape(len(self.mark_time), len(self.names), 3)
         self.time, pose = recording.table(["x", "y", "z", "qw", "qx", "qy", "qz"])
         self.position, quat = pose[:, :3], pose[:, 3:]
-        self.planar = "z" not in signals and "depth" not in signals
+        self.planar = "z" not in signals
         self.quat: np.ndarray | None = quat if "qw" in signals else None
         self.level = False
         if self.quat is None and "yaw" in signals:
@@ -542,6 +559,9 @@ class _View:
                 for n in ("yaw", "pitch", "roll")
             ]
             self.quat = Rotation.from_euler("ZYX", np.stack(turns, -1)).as_quat(scalar_first=True)
+            for n in ("yaw", "pitch", "roll"):
+                if n in signals:
+                    self.quat[gap(signals[n].time, self.time)] = np.nan
             self.level = "roll" not in signals
         if self.names:
             self._fit_marks()
@@ -573,10 +593,11 @@ class _View:
             self.hinges) else np.zeros((len(self.mark_time), 0))  # fmt: skip
         model = self.points.on_core(angles)
         length = float(body_geometry(self.robot).length)
-        check_marks(model, self.seen, self.planar, self.names, self.mark_time, length)
+        seen = joined_marks(self.mark_time, self.seen, dims)
+        check_marks(model, seen, self.planar, self.names, self.mark_time, length)
         self.time = self.mark_time
         if len(self.names) >= dims:
-            self.position, self.quat, _ = fit_rigid(model, self.seen, self.planar)
+            self.position, self.quat, _ = fit_rigid(model, seen, self.planar)
             self.quat[np.isnan(self.position[:, 0])] = np.nan
             self.level = self.planar
         else:
@@ -585,9 +606,11 @@ class _View:
             self.position[:, 2] = np.nan
 
     def _angle(self, hinge: str, at: np.ndarray) -> np.ndarray:
-        for kind in ("angle", "command"):
-            if (signal := self.recording.signals.get(f"{kind}.{hinge}")) is not None:
-                return np.interp(at, *signal)
+        if (signal := self.recording.signals.get(f"angle.{hinge}")) is not None:
+            return np.interp(at, *signal)
+        if (signal := self.recording.signals.get(f"command.{hinge}")) is not None:
+            held = np.searchsorted(signal.time, at, "right") - 1
+            return signal.value[np.maximum(held, 0)]
         return np.zeros(len(at))
 
     def hinges_at(

@@ -32,6 +32,8 @@ _UNITS = {"_m": 1.0, "_cm": 1e-2, "_mm": 1e-3, "_s": 1.0, "_ms": 1e-3, "_us": 1e
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz", "roll", "pitch", "yaw", "depth", "mean_speed")
 _PLACE = ("x", "y", "z")
 _SENSED = tuple(f"{kind}.{axis}" for kind in ("gyro", "accel") for axis in "xyz")
+_SIGNAL = re.compile("|".join([*map(re.escape, ("time", *_POSE, *_SENSED)),
+                               r"mark\..+\.[xyz]", r"(command|angle)\..+"]))  # fmt: skip
 _SOURCE = re.compile(r"^(?P<column>.*?)(?:\*(?P<factor>[-+0-9.eE]+))?$", re.DOTALL)
 # Faster than any robot of modules swims [body lengths/s]; wrong units are beyond it. A choice.
 _FASTEST = 30.0
@@ -41,8 +43,8 @@ _FASTEST_TURN = 4 * math.pi
 _STAYS = 5
 # Commands are sampled, and not as sent, where this share of them is of frames and is new. A choice.
 _SAMPLED = 0.6
-# A gap is longer than so many usual frames; one of two is a dropped frame. A choice.
-_GAP = 2.5
+GAP = 2.5
+"""A gap is longer than so many usual frames; one of two is a dropped frame. A choice."""
 
 
 class TimeSeries(NamedTuple):
@@ -130,10 +132,15 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
     marks = {key.removeprefix("mark."): _read_mark(key, columns[key], robot) for key in points}
     rest = {key: source for key, source in columns.items() if key not in points}
     unused: list[str] = []
+    run = path.is_dir() and (path / "run.json").is_file()
+    bag = not run and (path.is_dir() or path.suffix in (".mcap", ".db3"))
+    for name in rest:
+        if not _SIGNAL.fullmatch(name) and not (bag and name in _TYPES):
+            raise InputError(f"--map {name}", "the name of a signal", show(name))
     with reading(path):
-        if path.is_dir() and (path / "run.json").is_file():
-            signals = _read_run(path)
-        elif path.is_dir() or path.suffix in (".mcap", ".db3"):
+        if run:
+            signals = _mapped(_read_run(path), rest)
+        elif bag:
             signals = _read_bag(path, rest)
         else:
             signals, unused = _read_csv(path, rest, robot)
@@ -146,6 +153,22 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
     if unused:
         notes.append(f"columns of no known name, not read: {', '.join(unused)} (--map NAME=COLUMN)")
     return RobotRecording(path.stem, signals, marks, tuple(notes))
+
+
+def _mapped(
+    signals: dict[str, TimeSeries], columns: Mapping[str, str], topics: Sequence[str] = ()
+) -> dict[str, TimeSeries]:
+    """With the signals that a map takes from others of them, as `z=z*-1`."""
+    found = dict(signals)
+    for name, source in columns.items():
+        match = _SOURCE.match(source)
+        assert match is not None
+        if match["column"] not in signals:
+            known = ", ".join([*signals, *topics])
+            raise InputError(f"--map {name}", f"one of {known}, also with *FACTOR", show(source))
+        time, value = signals[match["column"]]
+        found[name] = TimeSeries(time, _factor(name, match["factor"] or "1") * value)
+    return found
 
 
 def _read_mark(key: str, source: str, robot: Robot) -> MarkedPoint:
@@ -168,7 +191,10 @@ def _read_csv(
 ) -> tuple[dict[str, TimeSeries], list[str]]:
     """Signals by name, and the columns that are none."""
     text = read_file(path).decode("utf-8-sig")
-    rows = list(csv.reader(io.StringIO(text)))
+    try:
+        rows = list(csv.reader(io.StringIO(text, newline=None)))
+    except csv.Error as error:
+        raise InputError(f"expected a CSV; found: {error}") from None
     rows = [row for row in rows if any(cell.strip() for cell in row)]
     if not rows:
         raise InputError("expected a line of column names and rows of numbers; found an empty file")
@@ -230,8 +256,10 @@ def _name_columns(
         assert match is not None
         column, factor = match["column"], match["factor"]
         if column in header:
-            usual = 1.0 if factor or column == name else _unit(column)[1]
-            found[name] = header.index(column), _factor(name, factor) if factor else usual
+            scale = _factor(name, factor) if factor else 1.0
+            if column != name and abs(scale) == 1.0:  # a sign leaves the unit as it is
+                scale *= _unit(column)[1]
+            found[name] = header.index(column), scale
             continue
         number = _finite(source)
         if number is None:
@@ -294,10 +322,10 @@ def _unit(column: str) -> tuple[str, float]:
 
 
 def _read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, TimeSeries]:
-    """Topics by their types; of several of one type the first, or what `odometry=/topic` names.
+    """Topics by their types; of several poses the first, or what `odometry=/topic` names.
 
-    All of joints, points (marks, by the last of their topics' names) and numbers (`depth`, or what
-    `command.port=/topic*FACTOR` names) are read.
+    Of several of another type it is the same; but all of joints, points (marks, by the last of
+    their topics' names) and numbers (`depth`, or what `command.port=/topic*FACTOR` names) are read.
     """
     check_package("a bag", "rosbags")
     from rosbags.rosbag2 import Reader
@@ -313,12 +341,21 @@ def _read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, TimeSeries]:
         named[match["column"]] = name, _factor(name, match["factor"] or "1")
     try:
         with Reader(path) as bag:
+            topics = {c.topic: c.msgtype.rpartition("/")[2] for c in bag.connections}
+            read = {
+                name for name, source in columns.items()
+                if (name in _TYPES and topics.get(source) == _TYPES[name])
+                or topics.get(source.partition("*")[0]) in _NUMBERS
+            }  # fmt: skip
             for connection, stamp, raw in bag.messages():
                 kind, topic = connection.msgtype.rpartition("/")[2], connection.topic
                 if (use := _TOPICS.get(kind)) is None:
                     continue
-                role = f"{kind} {topic}" if kind in _MANY else kind
-                if chosen.setdefault(role, columns.get(kind.lower(), topic)) != topic:
+                # All poses are of the core: one topic has them.
+                alike = _POSES if kind in _POSES else (kind,)
+                wanted = [columns[x.lower()] for x in alike if x.lower() in columns]
+                role = f"{kind} {topic}" if kind in _MANY else alike[0]
+                if chosen.setdefault(role, wanted[0] if wanted else topic) != topic:
                     continue
                 message = store.deserialize_cdr(raw, connection.msgtype)
                 for name, value in use(message, topic):
@@ -341,7 +378,8 @@ def _read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, TimeSeries]:
         order = np.argsort(time, kind="stable")
         once = np.append(True, np.diff(time[order]) > 0)
         found[name] = TimeSeries(time[order][once] - first, value[order][once])
-    return found
+    others = {name: source for name, source in columns.items() if name not in read}
+    return _mapped(found, others, list(topics))
 
 
 def _pose(pose: Any) -> Iterable[tuple[str, float]]:
@@ -385,6 +423,8 @@ _TOPICS: dict[str, Callable[[Any, str], Iterable[tuple[str, float]]]] = {
     "Float64": _number,
     "Float32": _number,
 }
+_TYPES = {kind.lower(): kind for kind in _TOPICS}
+_POSES = "Odometry", "PoseStamped"
 _NUMBERS = "Float64", "Float32"
 _MANY = ("JointState", "PointStamped", *_NUMBERS)
 
@@ -574,7 +614,7 @@ def _gaps(signals: Mapping[str, TimeSeries]) -> list[str]:
         steps = np.diff(time)
         usual = float(np.median(steps))
         lost = np.round(steps / usual) - 1
-        single, long = int((lost == 1).sum()), steps[steps > _GAP * usual]
+        single, long = int((lost == 1).sum()), steps[steps > GAP * usual]
         group = name.partition(".")[0] if name.startswith("mark.") else "frames"
         if single or len(long):
             words = f"{group} at {1 / usual:.3g} Hz: {single} dropped"
