@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 
 from mjx_revolve.inputs.commands import Parser, check_place, program, read_path, run_command
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import short_path, write_atomic
 from mjx_revolve.inputs.trust import add_trust_argument, opening
 from mjx_revolve.numerics import runtime
@@ -53,6 +54,11 @@ def main(argv: list[str] | None = None) -> int:
     for row in passport.rows:
         *cells, verdict = (*(x.ljust(w) for x, w in zip(row, widths, strict=False)), row[-1])
         print("  ".join((*cells, verdict)).rstrip())
+    with opening(arguments.run, trust=arguments.trust):
+        now = RunReader(folder).load_champion()  # that of a run under way may be another one
+        if now.facts != champion.facts or list(now.genes) != list(champion.genes):
+            tried = "the champion that was tried"
+            raise InputError(folder / "champion", tried, "another one: the run goes on")
     write_atomic(folder / PASSPORT, passport.to_text().encode())
     print(f"\n{passport.mark or 'passes'}: {short_path(folder / PASSPORT)}")
     return 1 if passport.failed else 0

@@ -165,7 +165,7 @@ def from_record(
 
 def to_text(individual: Individual, genotype: Genotype) -> str:
     """A line of JSON."""
-    return json.dumps(to_record(individual, genotype), separators=(",", ":"))
+    return json.dumps(to_record(individual, genotype), separators=(",", ":"), default=str)
 
 
 def to_records(individuals: Iterable[Individual], genotype: Genotype) -> list[dict[str, object]]:
@@ -215,7 +215,7 @@ def reading_state(
 
 def pack_json(value: object) -> np.ndarray:
     """Plain values as an array of bytes."""
-    return np.frombuffer(json.dumps(value).encode(), np.uint8)
+    return np.frombuffer(json.dumps(value, default=str).encode(), np.uint8)
 
 
 def unpack_json(array: np.ndarray) -> Any:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -62,7 +62,7 @@ class Job:
     """Everything a fitness is made from, as values that can be sent to a process on any machine.
 
     Attributes:
-        config: the configuration as JSON.
+        config: the configuration's settings, as they are; JSON has other keys than YAML.
         source: its name in messages.
         files: the files that it names, by the relative paths in it.
         make_fitness: makes the fitness; pickled by its name.
@@ -70,7 +70,7 @@ class Job:
         limits: of the workers.
     """
 
-    config: str
+    config: Mapping[str, Any]
     source: str
     files: tuple[tuple[str, bytes], ...]
     make_fitness: MakeFitness
@@ -114,7 +114,7 @@ def make_job(config: Config, make_fitness: MakeFitness | None = None) -> Job:
         raise ValueError(f"make_fitness: expected a function that can be imported; found {name}")
     settings, files = copy_files(config.model_dump(), Config)
     keeps = make is own and not config.has_user_code
-    return Job(json.dumps(settings), config.source, tuple(files.items()), make, keeps, LIMITS)
+    return Job(settings, config.source, tuple(files.items()), make, keeps, LIMITS)
 
 
 def open_job(job: Job, scratch: str | Path) -> Any:
@@ -134,7 +134,7 @@ def open_job(job: Job, scratch: str | Path) -> Any:
     for name, content in job.files:
         places[name] = Path(scratch) / name
         write_atomic(places[name], content)
-    settings = locate_files(json.loads(job.config), places)
+    settings = locate_files(job.config, places)
     return job.make_fitness(make_config(settings, "/", source=job.source))
 
 
@@ -148,10 +148,11 @@ def compile_job(job: Job, fitness: object) -> None:
     from mjx_revolve.evolution.blocks import evaluate_block, example_block
     from mjx_revolve.evolution.fingerprints import hash_text
 
-    example = example_block(fitness, json.loads(job.config)["evolution"]["population_size"])
+    example = example_block(fitness, job.config["evolution"]["population_size"])
     lock: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
     if not job.keeps_programs:
-        lock = runtime.compile_lock("job", hash_text(function_name(job.make_fitness), job.config))
+        name = hash_text(function_name(job.make_fitness), json.dumps(job.config, default=str))
+        lock = runtime.compile_lock("job", name)
     with lock:
         evaluate_block(fitness, example, jax.random.key(0))
 

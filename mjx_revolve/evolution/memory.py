@@ -7,6 +7,7 @@ import contextlib
 from pathlib import Path
 
 from mjx_revolve.episodes.config import Config
+from mjx_revolve.evolution.strategies import find_strategy
 from mjx_revolve.inputs.errors import InputError
 
 # Memory of an individual: so many copies of its genes, and so many numbers more (scores, ranks,
@@ -34,7 +35,7 @@ def check_memory(config: Config, num_genes: int) -> None:
     one = 4 * (_COPIES * num_genes + _MORE)
     counts, pair = {"evolution.population_size": evolution.population_size}, 0
     if bodies is None:
-        pair = _PAIRS.get(evolution.strategy, 0)
+        pair = _PAIRS.get(find_strategy(evolution.strategy), 0)
     else:
         one = _BODY + one * bodies.learning.population_size
         counts["bodies.selection.offspring"] = bodies.selection.offspring or 0
@@ -64,9 +65,15 @@ def free_memory(root: Path = Path("/")) -> int | None:
             if line.startswith("MemAvailable:"):
                 found.append(1024 * int(line.split()[1]))
     with contextlib.suppress(OSError, ValueError):  # no container, or one without a limit ("max")
+        group = root / "sys/fs/cgroup"
         limit, used = (
-            int((root / "sys/fs/cgroup" / name).read_text(encoding="ascii"))
+            int((group / name).read_text(encoding="ascii"))
             for name in ("memory.max", "memory.current")
         )
-        found.append(max(0, limit - used))
+        cache = 0  # of files, which the kernel gives back
+        with contextlib.suppress(OSError, ValueError):
+            for line in (group / "memory.stat").read_text(encoding="ascii").splitlines():
+                name, count = line.split()
+                cache += int(count) if name in ("inactive_file", "active_file") else 0
+        found.append(max(0, limit - used + cache))
     return min(found, default=None)

@@ -77,6 +77,7 @@ class Run:
     resumed: bool = False
     _steps: Iterator[tuple[Any, dict[str, float]]] | None = field(default=None, repr=False)
     _unsaved: bool = field(default=False, repr=False)
+    _settings: Sequence[str] = field(default=(), repr=False)  # that a resumed run was given
 
     @property
     def generation(self) -> int:
@@ -96,9 +97,10 @@ class Run:
 
     @property
     def is_finished(self) -> bool:
-        """Whether it has all its generations and its champion already."""
+        """Whether it has all its generations and its champion already, chosen as is asked for."""
         done = self.generation >= self.config.evolution.generations
-        return done and "finished" in self.folder.info
+        known = self.folder.load_config().evolution.passport
+        return done and "finished" in self.folder.info and known == self.config.evolution.passport
 
     # --- begin and resume ---
 
@@ -196,8 +198,8 @@ class Run:
             if checkpoint is None and files.champion_path:
                 # A champion is written after a checkpoint: all of them are lost, which this says.
                 files.load_checkpoint()
-            files.update_info(settings=[*earlier, *_portable(settings, config)])
             run = cls(files, config, executor, make_evolution(config, executor), resumed=True)
+            run._settings = [*earlier, *_portable(settings, config)]
             if checkpoint is not None:
                 if found := _differences(checkpoint.meta.get("host"), describe_host()):
                     _log.warning(
@@ -207,6 +209,12 @@ class Run:
                 with reading(checkpoint.path):
                     run.search = run.evolution.from_arrays(checkpoint.arrays)
                 run.checkpoint = checkpoint
+                done = run.generation
+                if done > config.evolution.generations and "finished" not in files.info:
+                    least = f"at least {done}, which are done"
+                    raise InputError(
+                        f"{label}: evolution.generations", least, config.evolution.generations
+                    )
             failed.pop_all()
             return run
 
@@ -252,7 +260,9 @@ class Run:
             files.save_config(self.config)
             resumption = {"time": timestamp(), "generation": self.generation, "argv": sys.argv}
             resumed = [*files.info.get("resumed", []), resumption]
-            files.update_info(resumed=resumed, finished=None, champion=None)
+            files.update_info(
+                settings=self._settings, resumed=resumed, finished=None, champion=None
+            )
         files.update_info(workers=self.executor.describe())
         # Where the body is the same for all, it is there from the start.
         if isinstance(self.executor.fitness, Fitness):
@@ -373,6 +383,7 @@ class Run:
         if champion.individual is not None:
             facts["individual"] = champion.individual
         self.folder.save_champion(champion.genes, champion.body, final=True, **facts)
+        (self.folder.path / PASSPORT).unlink(missing_ok=True)  # an earlier choice's
         champion = self._judge(champion, say)
         say("drawing pictures")
         draw(self, champion)

@@ -216,7 +216,13 @@ class RunFolder(RunReader):
         """
         data = {**facts, "config": "../config.yaml"}
         if body is not None:
-            self.write("champion/morphology.yaml", body.save)
+
+            def save(path: Path) -> None:
+                """Wherever this stops, no genes stand beside another body."""
+                body.save(path)
+                (self.path / "champion/genes.yaml").unlink(missing_ok=True)
+
+            self.write("champion/morphology.yaml", save)
             data["morphology"] = "morphology.yaml"
         data["genes"] = [float(gene) for gene in genes]
         text = dump_yaml(data, default_flow_style=None)

@@ -22,6 +22,7 @@ from typing import Annotated, Literal, NamedTuple
 from annotated_types import Ge, Le, MinLen
 
 from mjx_revolve.episodes.config import Config, load_config
+from mjx_revolve.episodes.run_reader import read_metrics
 from mjx_revolve.evolution.executor import Executor, make_executor
 from mjx_revolve.evolution.fingerprints import FREE_SETTINGS, fitness_hash
 from mjx_revolve.evolution.generations import Champion
@@ -113,9 +114,12 @@ def next_step(plan: Plan) -> Step:
     if not folder.exists() or (not (folder / "config.yaml").exists() and is_new_folder(folder)):
         return "begin"
     with contextlib.closing(open_run_folder(folder)) as run:
-        check_unchanged(run.load_config(), wanted, label)
+        old = run.load_config()
+        check_unchanged(old, wanted, label)
         found, length = _generations(run), wanted.evolution.generations
-        finished = "finished" in run.info
+        # Another kind of passport may choose another champion.
+        judged = old.evolution.passport == wanted.evolution.passport
+        finished = judged and "finished" in run.info
     if found > length:
         most = f"a run of {length} generations at most"
         raise InputError(label, most, f"{found} (choose another --out)")
@@ -125,9 +129,11 @@ def next_step(plan: Plan) -> Step:
 
 
 def _generations(run: RunFolder) -> int:
-    """How many generations a run has done."""
-    metrics = run.load_metrics() if run.metrics_path.exists() else {}
-    return int(metrics["generation"][-1]) if len(metrics.get("generation", ())) else 0
+    """How many generations a run has done, by the lines that are whole; a run drops others."""
+    if not run.metrics_path.exists():
+        return 0
+    done = read_metrics(run.metrics_path).columns.get("generation")
+    return 0 if done is None or not len(done) else int(done[-1])
 
 
 # --- sweeps ---------------------------------------------------------------------------------------
