@@ -61,10 +61,10 @@ def compile_model(assembly: Assembly) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     # MuJoCo's own fluid stays off in every engine: hydrodynamics owns the water.
     spec.option.density = 0.0
     spec.option.viscosity = 0.0
-    _add_bed(spec, morphology, world)
-    _add_bodies(spec, assembly)
-    _add_pairs(spec, assembly)
     try:
+        _add_bed(spec, morphology, world)
+        _add_bodies(spec, assembly)
+        _add_pairs(spec, assembly)
         return spec, spec.compile()
     except ValueError as error:
         reason = str(error).splitlines()[0]
@@ -154,7 +154,7 @@ def _add_bodies(spec: mujoco.MjSpec, assembly: Assembly) -> None:
             pose = table.position[row], table.rotation[row]
             _add_geoms(carrier, module, part, *pose, assembly.world)
             if part.thruster is not None:
-                _add_thruster(spec, carrier, f"{module.name}/{part.name}", part, *pose)
+                _add_thruster(spec, carrier, module, part, *pose)
             row += 1
 
 
@@ -196,22 +196,25 @@ def _add_hinge(spec: mujoco.MjSpec, assembly: Assembly, number: int, body: Any) 
 
 
 def _add_thruster(
-    spec: mujoco.MjSpec, body: Any, name: str, part: Part, place: np.ndarray, turn: np.ndarray
+    spec: mujoco.MjSpec, body: Any, module: Module, part: Part, place: np.ndarray, turn: np.ndarray
 ) -> None:
     """A thruster as stock MuJoCo can have it: a filtered force at a site, linear in the command.
 
     Our engines take lag and limits from here and thrust from the thruster's own curve, which
     MuJoCo cannot represent; its gain is the mean gradient of the curve over the command's range.
     """
-    thruster = part.thruster
+    thruster, name = part.thruster, f"{module.name}/{part.name}"
     assert thruster is not None
+    # The module's name, where it is the only actuator there.
+    jets = [other for other in module.kind.parts if other.thruster is not None]
+    alone = module.kind.hinge is None and len(jets) == 1
     axis = turn @ np.asarray(thruster.axis)
     body.add_site(name=name, pos=place + turn @ np.asarray(thruster.position))
     low, high = thruster.range
     ends = thruster_curve(thruster, np.array([low, high]))
     lag = thruster.time_constant > 0
     spec.add_actuator(
-        name=name.split("/")[0],
+        name=module.name if alone else name,
         target=name,
         trntype=mujoco.mjtTrn.mjTRN_SITE,
         gear=[*axis, *(-thruster.torque_ratio * axis)],

@@ -223,7 +223,7 @@ def _command_names(robot: Robot) -> tuple[str, ...]:
     joints = [link.joint for link in make_links(robot) if link.joint is not None]
     hinges = {joint.ctrl: joint.name for joint in joints}
     jets = [plain(robot.mj_model.actuator(k).name) for k in robot.thrusters]
-    return (*(hinges[k] for k in robot.servos), *jets)
+    return tuple(unique_names([*(hinges[k] for k in robot.servos), *jets], set()))
 
 
 def _wide(x: object) -> Any:

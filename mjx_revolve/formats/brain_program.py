@@ -85,6 +85,9 @@ ELEMENTWISE: dict[str, Form] = {
 _REALS_ONLY = ("pow", "clamp")
 _REDUCTIONS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min"}
 
+# What they are of no elements, as of robots without hinges.
+_OF_NOTHING = {"reduce_sum": 0, "dot_general": 0, "reduce_prod": 1,
+               "reduce_max": -np.inf, "reduce_min": np.inf}  # fmt: skip
 _NEUTRAL = {"add": 0, "sub": 0, "mul": 1, "div": 1}
 _SAME = ("materialize", "copy", "copy_p", "optimization_barrier", "reduce_precision")
 _CALLS = (
@@ -262,7 +265,11 @@ class Builder:
                 "controller: expected a step without the simulation's sensor noise, as devices "
                 "have their own; found one that reads its seed"
             )
-        shapes = [atom.aval.shape for atom in equation.invars]
+        shapes, out = [atom.aval.shape for atom in equation.invars], equation.outvars[0].aval
+        if len(equation.outvars) == 1 and out.size == 0:  # as of robots without hinges
+            return [self.constant(np.zeros(0, out.dtype))]
+        if name in _OF_NOTHING and any(atom.aval.size == 0 for atom in equation.invars):
+            return [self.constant(np.full(out.size, _OF_NOTHING[name], out.dtype))]
         if name in _MOVES:
             return self._move(equation, args, shapes)
         known = [self.values[number].data for number in args]
@@ -270,7 +277,6 @@ class Builder:
             arrays = [np.asarray(x).reshape(shape) for x, shape in zip(known, shapes, strict=True)]
             found = equation.primitive.bind(*arrays, **params)
             return [self.constant(x) for x in (found if isinstance(found, list) else [found])]
-        out = equation.outvars[0].aval
         kind, size = kind_of(out.dtype), int(np.prod(out.shape))
         if name in _REDUCTIONS and kind != "bool":
             keep = [k for k in range(len(shapes[0])) if k not in params["axes"]]
@@ -317,6 +323,8 @@ class Builder:
         """An operation that only moves elements, applied to their indices."""
         name, params = equation.primitive.name, equation.params
         outs = [atom.aval.shape for atom in equation.outvars]
+        if name == "gather" and params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP:
+            return self._gather_or_fill(equation, args, shapes)
         which = _MOVES[name]
         moved = [*range(len(args))] if which is None else [*which]
         first, grids = 0, []
@@ -340,6 +348,25 @@ class Builder:
         found = made if isinstance(made, list | tuple) else [made]
         sources = [args[k] for k in moved]
         return [self.take(sources, np.asarray(x)) for x in found]
+
+    def _gather_or_fill(
+        self, equation: Any, args: list[int], shapes: list[tuple[int, ...]]
+    ) -> list[int]:
+        """Elements at constant places; those past the end are what the operation fills in."""
+        where, size = self.values[args[1]].data, self.values[args[0]].size
+        if where is None:
+            raise InputError(
+                "controller: expected constant places in arrays; found JAX's 'gather' at places "
+                "that its step computes"
+            )
+        params, dtype = equation.params, equation.outvars[0].aval.dtype
+        grid = np.arange(size, dtype=np.int32).reshape(shapes[0])
+        params = {**params, "fill_value": size}
+        at = equation.primitive.bind(grid, where.reshape(shapes[1]), **params)
+        fill = equation.params["fill_value"]
+        usual = {"real": np.nan, "bool": True}.get(kind_of(dtype), np.iinfo(np.int32).min)
+        blank = self.constant(np.full(1, usual if fill is None else fill, dtype))
+        return [self.take([args[0], blank], np.asarray(at))]
 
     def _fold(self, op: str, kind: str, terms: list[int]) -> int:
         """Terms put together one after the other."""

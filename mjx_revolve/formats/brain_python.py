@@ -110,7 +110,8 @@ def make_brain_python(brain: Brain) -> str:
     if states:
         after = [code.name_of(program.after[k]) for k in code.live_states]
         body.append(f"self.state = ({', '.join(after)},)")
-    body.append(f"return {code.name_of(program.commands)}.copy()")
+    count = len(brain.commands)
+    body.append(f"return np.array({code.name_of(program.commands)}, REAL).reshape({count})")
     return TEMPLATES.get_template("brain.py.jinja").render(
         title=title,
         words="\n".join(words),

@@ -37,9 +37,13 @@ def part_spread(part: Part) -> np.ndarray:
 
     The mass is spread evenly over the main box; a ballast is a small ball.
     """
+    return _whole(part) - (0 if part.thruster is None else propeller(part)[0])
+
+
+def _whole(part: Part) -> np.ndarray:
     box = spread(part.mass, np.zeros(3), np.diag(np.square(part.boxes[0].size)) / 12)
     ball = spread(part.ballast_mass, part.ballast_position, BALLAST_RADIUS**2 / 5 * np.eye(3))
-    return box + ball - (0 if part.thruster is None else propeller(part)[0])
+    return box + ball
 
 
 def propeller(part: Part) -> tuple[np.ndarray, float]:
@@ -50,7 +54,11 @@ def propeller(part: Part) -> tuple[np.ndarray, float]:
     size = np.asarray(part.boxes[0].size)
     diameter = 0.9 * float((size[across] if across.any() else size).min())
     square = diameter**2 / 16 * (np.eye(3) - np.outer(axis, axis))
-    return spread(max(_ROTOR * part.mass, LEAST), part.thruster.position, square), diameter
+    mass, one = _ROTOR * part.mass, spread(1.0, part.thruster.position, square)
+    # Outside of the part's box it weighs less, or what is left has an inertia that no body has.
+    while mass > LEAST and np.linalg.eigvalsh(_whole(part) - mass * one)[0] <= 0:
+        mass /= 2
+    return max(mass, LEAST) * one, diameter
 
 
 def moments(body: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:

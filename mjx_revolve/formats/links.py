@@ -7,8 +7,9 @@ one to one.
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,8 +31,8 @@ from mjx_revolve.water.world import World
 
 # The names of ROS (REP 105) for the fixed frame, for the odometry's, and for the robot's main part.
 WORLD, ODOM, BASE = "world", "odom", "base_link"
-
-
+# What SDF's elements add to the name of a part.
+_ADDED = "", "_weld", "_propeller", "_propeller_joint"
 # A bed within this depth below the surface is exported [m]: a robot starts 1 m deep.
 _BED_DEPTH = 5.0
 
@@ -266,7 +267,7 @@ def _parts(morphology: Morphology) -> list[tuple[Module, Part]]:
 
 def _place_parts(robot: Robot, taken: set[str]) -> list[PlacedPart]:
     table, parts = robot.fluid, _parts(robot.morphology)
-    names = unique_names([plain(f"{m.name}_{p.name}") for m, p in parts], taken)
+    names = unique_names([plain(f"{m.name}_{p.name}") for m, p in parts], taken, _ADDED)
     rows = zip(names, _mesh_names(robot.morphology), parts, strict=True)
     return [
         PlacedPart(
@@ -288,26 +289,37 @@ def _place_parts(robot: Robot, taken: set[str]) -> list[PlacedPart]:
 
 def _mesh_names(morphology: Morphology) -> list[str]:
     """For each part the name of its mesh: that of type and part, numbered where shapes differ."""
-    seen: dict[str, list[object]] = {}
-    names = []
-    for module, part in _parts(morphology):
-        stem = plain(f"{module.kind.name}_{part.name}").lower()
+    parts = _parts(morphology)
+    stems = [plain(f"{module.kind.name}_{part.name}").lower() for module, part in parts]
+    taken, names = {*stems}, []
+    seen: dict[str, list[tuple[object, str]]] = {}
+    for stem, (module, part) in zip(stems, parts, strict=True):
         # All that a mesh depends on.
         drawn = (module.kind.hinge, part.boxes, part.volume, part.position, part.thruster)
-        shapes = seen.setdefault(stem, [])
-        if drawn not in shapes:
-            shapes.append(drawn)
-        number = shapes.index(drawn)
-        names.append(f"{stem}_{number + 1}" if number else stem)
+        known = seen.setdefault(stem, [])
+        name = next((name for shape, name in known if shape == drawn), None)
+        if name is None:
+            name = free_name(stem, taken) if known else stem
+            taken.add(name)
+            known.append((drawn, name))
+        names.append(name)
     return names
 
 
-def unique_names(names: list[str], taken: set[str]) -> list[str]:
-    """The names, those that are taken with a number at the end."""
+def unique_names(names: list[str], taken: set[str], added: Sequence[str] = ("",)) -> list[str]:
+    """The names, those that are taken with a number at the end.
+
+    Args:
+        names: in order; the first of equal ones stays.
+        taken: others.
+        added: what is put behind names in turn; all of that is unique, too.
+    """
     taken, found = {*taken}, []
     for name in names:
-        found.append(free_name(name, taken) if name in taken else name)
-        taken.add(found[-1])
+        numbered = itertools.chain([name], (f"{name}_{k}" for k in itertools.count(2)))
+        free = (one for one in numbered if taken.isdisjoint(f"{one}{end}" for end in added))
+        found.append(next(free))
+        taken |= {f"{found[-1]}{end}" for end in added}
     return found
 
 

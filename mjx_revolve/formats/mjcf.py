@@ -16,6 +16,7 @@ from mjx_revolve.formats.links import (
     make_meshes,
     missing_flow,
     near_bed,
+    unique_names,
     words_on_laws,
 )
 from mjx_revolve.formats.xml_text import to_comment, to_list
@@ -107,13 +108,16 @@ def _show_meshes(robot: Robot, spec: mujoco.MjSpec, links: tuple[Link, ...]) -> 
             userface=np.asarray(mesh.faces, np.int32).ravel(),
             inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
         )
+    taken = {geom.name for geom in spec.geoms}
     for link in links:
         body = spec.body(robot.mj_model.body(link.body).name)
         for part in link.parts:
+            seen = unique_names([f"{part.name}/mesh"], taken)[0]
+            taken.add(seen)
             for name in part.geoms:
                 spec.geom(name).group = _HIDDEN
             body.add_geom(
-                name=f"{part.name}/mesh",
+                name=seen,
                 type=mujoco.mjtGeom.mjGEOM_MESH,
                 meshname=part.mesh,
                 pos=part.position,
@@ -166,11 +170,14 @@ def _lift(robot: Robot, spec: mujoco.MjSpec) -> None:
     """Adds bodies at the centres of buoyancy, since MuJoCo lifts at centres of mass only."""
     world, table, model, floats = robot.world, robot.fluid, robot.mj_model, _floats(robot)
     center = table.position + np.einsum("pij,pj->pi", table.rotation, table.center_of_volume)
+    taken = {body.name for body in spec.bodies}
     for body in np.unique(table.body[floats]):
         rows = floats & (table.body == body)
         volume = table.volume[rows]
+        name = unique_names([f"{model.body(body).name}/lift"], taken)[0]
+        taken.add(name)
         spec.body(model.body(body).name).add_body(
-            name=f"{model.body(body).name}/lift",
+            name=name,
             pos=volume @ center[rows] / volume.sum(),
             explicitinertial=True,
             mass=_FEATHER,

@@ -119,7 +119,7 @@ def read_rigid_robot(path: str | Path) -> RigidRobot:
     with reading(path):
         try:
             root = ElementTree.fromstring(text)
-        except ElementTree.ParseError as error:
+        except (ElementTree.ParseError, LookupError, ValueError) as error:  # and encodings
             raise InputError(f"expected XML; found: {error}") from None
         if root.tag not in ("robot", "mujoco"):
             raise InputError(f"expected URDF (robot) or MJCF (mujoco); found <{root.tag}>")

@@ -119,10 +119,14 @@ def _describe(kind: ModuleType, part: Part) -> str:
         words.append(
             "fixed to the parent" if part is kind.parts[0] else "moves; the servo, to buy, is in it"
         )
-    # Of both together the centre is given; that of the material is the box's.
-    both = (part.volume + part.electronics_volume) / (part.electronics_volume or 1.0)
+    # Of material and sealed volume the centre of both is given: the material's is taken to be the
+    # box's, unless what is sealed would lie outside of it.
+    sealed, joint = "sealed volume", np.asarray(part.center_of_volume)
+    alone = joint * (part.volume + part.electronics_volume) / (part.electronics_volume or 1.0)
+    if np.any(np.abs(alone) > np.asarray(part.boxes[0].size) / 2):
+        sealed, alone = "sealed volume, its centre and the material's together", joint
     for volume, what, center in (
-        (part.electronics_volume, "sealed volume", both * np.asarray(part.center_of_volume)),
+        (part.electronics_volume, sealed, alone),
         (part.ballast_volume, "ballast or float", np.asarray(part.ballast_position)),
     ):
         if volume:
