@@ -43,7 +43,6 @@ from mjx_revolve.inputs.errors import InputError
 _PERCENT = 1.0  # the error at which engines are compared [% of the way]
 _OURS, _FEW = 64, 16  # individuals whose ends are compared: ours alone, and beside C
 _DRAWN = 512  # random gaits, of which the best are swum; as many are timed
-_BODIES = 256  # different bodies
 # Individuals of MJX that are compared, and that are timed; steps of a call.
 _MJX, _TIMED, _CALL = 4, 64, 100
 _USUAL = 0.005  # the timestep that is timed [s]; a step takes as long whatever its length
@@ -71,6 +70,8 @@ class Case:
     Attributes:
         name: of the case.
         robot: its morphology; "" for different bodies.
+        bodies: how many different ones.
+        learners: individuals of each body that are timed, as where bodies learn in their lives.
         settings: of the configuration `config`, by dotted name.
         config: a shipped configuration.
         beside: whether MuJoCo C swims in the same water.
@@ -87,6 +88,8 @@ class Case:
     mjx: bool = False
     steps: tuple[float, ...] = (0.025, 0.01, 0.005, 0.0025)
     spread: float = 0.5
+    bodies: int = 256
+    learners: int = 1
 
 
 _WEIGHTLESS = {"world": PHYSICS["ellipsoid"], "trim": "none"}
@@ -95,7 +98,12 @@ _LAKE = {"name": "lake", "gust": _GUST}
 CASES = (
     Case("spider, ellipsoid law", "spider", _WEIGHTLESS, beside=True, mjx=True, steps=_SHORT),
     Case("snake, ellipsoid law", "snake", _WEIGHTLESS, beside=True, steps=_SHORT),
-    Case(f"{_BODIES} bodies, ellipsoid law", "", _WEIGHTLESS, beside=True, steps=_SHORT[:3]),
+    Case("centipede, ellipsoid law", "centipede", _WEIGHTLESS, beside=True, steps=_SHORT),
+    Case("256 bodies, ellipsoid law", "", _WEIGHTLESS, beside=True, steps=_SHORT[:3]),
+    Case(
+        "26 bodies with 64 learners each, ellipsoid law", "", _WEIGHTLESS, beside=True,
+        steps=_SHORT[:3], bodies=26, learners=64,
+    ),
     Case(
         "spider, default water, gusts, sensors at 20 Hz", "spider",
         {"world": _LAKE, "controller": _SENSES},
@@ -107,7 +115,7 @@ CASES = (
          "controller": {"type": "feedback", "gain": 0.5, "between": "ramp"}},
         "configs/auv_hold_depth", spread=0.05,
     ),
-    Case(f"{_BODIES} bodies, default water, gusts", "", {"world": _LAKE, "trim": "none"}),
+    Case("256 bodies, default water, gusts", "", {"world": _LAKE, "trim": "none"}),
     Case(
         "spider crawling on the bed, default water", "spider",
         {"world": {"name": "lake"}, "task.type": "crawl", "trim": "none"},
@@ -183,7 +191,7 @@ class Ours:
 
         if self.case.robot:
             return [load_morphology(str(ROOT / "morphologies" / f"{self.case.robot}.yaml"))]
-        return [random_body(k, 4 + k % 13, 6) for k in range(_BODIES)]
+        return [random_body(k, 4 + k % 13, 6) for k in range(self.case.bodies)]
 
     def fitness(self, step: float) -> Any:
         """The fitness of a timestep, and its bodies' tables."""
@@ -218,10 +226,10 @@ class Ours:
         rounds, keys = (15, jax.random.split(jax.random.key(0), 15))
         key, count = jax.random.key(_KEY), fitness.num_genes
         if not self.case.robot:
-            shape = (rounds, _BODIES, count)
+            shape = (rounds, self.case.bodies, count)
             draws = self.case.spread * jax.random.normal(keys[0], shape)
             scores = np.stack([np.asarray(fitness(bodies, genes, key)) for genes in draws])
-            return draws[np.argmax(scores, 0), np.arange(_BODIES)]
+            return draws[np.argmax(scores, 0), np.arange(self.case.bodies)]
         mean, spread = np.zeros(count, np.float32), np.full(count, self.case.spread, np.float32)
         for drawn in keys:
             genes = mean + spread * jax.random.normal(drawn, (_DRAWN, count))
@@ -304,9 +312,12 @@ class Ours:
         key, genes = jax.random.key(_KEY), self.genes
         if self.case.robot:
             genes = jax.numpy.tile(genes, (_DRAWN // _OURS, 1))
+        elif self.case.learners > 1:
+            genes = jax.numpy.repeat(genes[:, None], self.case.learners, 1)
         given = (genes, key) if self.case.robot else (bodies, genes, key)
         run = lambda: jax.block_until_ready(fitness.evaluate(*given))  # noqa: E731
-        return run, len(genes) * fitness.num_timesteps * _USUAL
+        count = math.prod(genes.shape[:-1])
+        return run, count * fitness.num_timesteps * _USUAL
 
 
 # ------------------------------------------------------------------ MuJoCo
