@@ -26,7 +26,7 @@ if "mjx_revolve_state_" not in os.environ.get("XDG_STATE_HOME", ""):
 import jax
 import pytest
 
-from laboratory import WATER, arm_robot, body, compiled_quickly, elbow_robot, world
+from laboratory import WATER, body, compiled_quickly, elbow_robot, world
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.numerics import runtime
 from mjx_revolve.water.world import load_world
@@ -45,12 +45,6 @@ def spider():
 def core():
     """The core alone in deep still water, everything on."""
     return build_robot(body("core"), load_world("lake"))
-
-
-@pytest.fixture(scope="session")
-def arm():
-    """A small crooked body with nothing around it."""
-    return arm_robot(world())
 
 
 @pytest.fixture(scope="session")

@@ -4,8 +4,12 @@ from functools import lru_cache
 
 import mujoco
 import numpy as np
+import yaml
 
 from laboratory import body, read
+from mjx_revolve.body.catalogue import MODULES
+from mjx_revolve.body.module_files import read_modules
+from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.episodes.champion import Episode
 from mjx_revolve.episodes.simulate import Trajectory
@@ -39,7 +43,28 @@ body:
         1: {id: feeler, type: TouchSensor}
 """
 
-NAMES = ("spider", "auv", "fish", "centipede", "odd")
+# Own types, whose names clash once something is put behind them: two thrusters, one of them far
+# outside of its part, in a module; a hinge with a thruster; parts that differ in numbered names.
+OWN = """
+modules:
+  Jets:
+    mount: -x
+    parts:
+      - {name: motor, size: [0.03, 0.03, 0.03], mass: 0.02, thruster: {position: [0.06, 0, 0]}}
+      - {name: motor_propeller, size: [0.01, 0.02, 0.02], mass: 0.01, position: [0.04, 0, 0],
+         thruster: {gain: 2.0}}
+  Pod:
+    mount: -x
+    hinge: {axis: [0, 1, 0], anchor: [0.012, 0, 0]}
+    parts:
+      - {name: box, size: [0.02, 0.02, 0.02], mass: 0.01}
+      - {name: box_2, size: [0.03, 0.02, 0.02], mass: 0.01, position: [0.04, 0, 0],
+         thruster: {gain: 1.0}}
+body:
+  {type: Core, id: core, children: {0: {type: Jets, id: jet/left}, 1: {type: Jets, id: jet/right},
+   2: {type: Pod, id: core/lift}, 3: {type: Pod, id: pod, params: {mass: 0.03, volume: 5.0e-6}}}}
+"""
+NAMES = ("spider", "auv", "fish", "centipede", "odd", "own")
 
 
 @lru_cache
@@ -66,6 +91,10 @@ def lake_robot(name: str) -> Robot:
     """One of `NAMES` in the lake."""
     if name == "odd":
         return odd_episode().robot
+    if name == "own":
+        data = yaml.safe_load(OWN)
+        types = MODULES | read_modules({"modules": data.pop("modules")}, MODULES)
+        return build_robot(make_morphology(data, types), load_world("lake"))
     return build_robot(body(name), load_world("lake"))
 
 

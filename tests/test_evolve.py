@@ -111,7 +111,8 @@ def test_a_damaged_checkpoint_costs_only_time(folder, capsys):
 
 @pytest.mark.slow
 def test_a_finished_run(folder, capsys):
-    assert run_main("toy.yaml", "--out", "run", "--set", "evolution.generations=4") == 0
+    own = ("--seed", 3, "--set", "task.trials=3")
+    assert run_main("toy.yaml", "--out", "run", *own, "--set", "evolution.generations=4") == 0
     before = contents(folder / "run")
     capsys.readouterr()
     assert run_main("--resume", "run") == 0
@@ -119,11 +120,12 @@ def test_a_finished_run(folder, capsys):
         "loading run\nrun: finished after 4 generations; to go on: --set evolution.generations=8\n"
     )
     assert contents(folder / "run") == before
-    # Going on gives what a longer run would have given.
-    assert run_main("toy.yaml", "--out", "long") == 0
-    assert run_main("--resume", "run", "--set", "evolution.generations=7") == 0
+    # Going on gives what a longer run would have given, by the settings that it had.
+    assert run_main("toy.yaml", "--out", "long", *own) == 0
+    assert run_main("toy.yaml", "--resume", "run", "--set", "evolution.generations=7") == 0
     assert contents(folder / "run") == contents(folder / "long")
-    assert runs.RunFolder(folder / "run").load_config().evolution.generations == 7
+    config = runs.RunFolder(folder / "run").load_config()
+    assert (config.evolution.seed, config.task.trials, config.evolution.generations) == (3, 3, 7)
 
 
 def test_a_run_that_lacks_only_its_champion(folder):
@@ -146,14 +148,6 @@ def test_a_run_that_has_lost_its_checkpoints_does_not_begin_anew(folder, capsys)
     assert (folder / "run" / "metrics.csv").read_text() == before
 
 
-def test_resuming_remembers_the_settings(folder):
-    assert run_main("toy.yaml", "--out", "run", "--seed", 3, "--set", "task.trials=3") == 0
-    more = ("--set", "evolution.generations=8")
-    assert run_main("toy.yaml", "--resume", "run", *more) == 0
-    config = runs.RunFolder(folder / "run").load_config()
-    assert (config.evolution.seed, config.task.trials, config.evolution.generations) == (3, 3, 8)
-
-
 @pytest.fixture
 def stopped(folder):
     """A run that was dropped after its first checkpoint."""
@@ -170,7 +164,9 @@ def stopped(folder):
          "tensorboard, passport may change"),
 (["--seed", "9"], "--resume run: evolution.seed: expected 0 as in the run; found 9"),
 (["changed.yaml"], "run: task.type: expected 'speed' as in the run; found 'crawl'"),
-(["--out", "there"], "--resume run: expected no --out beside it; found there")
+(["--out", "there"], "--resume run: expected no --out beside it; found there"),
+(["--set", "evolution.generations=1"], "--resume run: evolution.generations: expected at least 2, "
+         "which are done; found 1")
 ],
 )  # fmt: skip
 def test_a_run_stays_the_same_run(stopped, argv, message, capsys):

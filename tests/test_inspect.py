@@ -42,14 +42,10 @@ def test_the_spider_weighs_what_the_thesis_says(capsys):
     assert _value(out, "buoyancy in water of 999.103 kg/m³") == pytest.approx(2.3671, abs=1e-4)
     assert _value(out, "net weight in water") == pytest.approx(0.156, abs=1e-3)
     assert _value(out, "relative density") == pytest.approx(1 / 0.93818, rel=1e-5)
-    assert "(sinks)" in out
-
-
-def test_descriptors_are_listed(capsys):
-    assert run(SPIDER) == 0
-    out = capsys.readouterr().out
+    assert "(sinks)" in out and "centre of mass at rest" in out
     for key, value in load_morphology(SPIDER).descriptors.items():
         assert _value(out, f"  {key} ") == pytest.approx(float(value), rel=1e-5)
+    assert thruster_table(load_morphology(SPIDER)) == []
 
 
 def test_thrusters_are_listed_with_what_they_do(capsys):
@@ -69,9 +65,6 @@ def test_thrusters_are_listed_with_what_they_do(capsys):
 
 
 def test_centres_of_mass_and_volume_are_shown(capsys):
-    assert run(SPIDER) == 0
-    out = capsys.readouterr().out
-    assert "centre of mass at rest" in out and thruster_table(load_morphology(SPIDER)) == []
     assert run(ROOT / "morphologies" / "fish.yaml") == 0
     out = capsys.readouterr().out
     (mass,), (volume,) = (

@@ -14,6 +14,7 @@ import pytest
 import toys
 from mjx_revolve import evolve, report, sweep
 from mjx_revolve.evolution.run_folder import RunFolder
+from mjx_revolve.evolution.sweeps import Plan, next_step
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.view.statistics import interval
 from toys import DroppedError, contents, dropping, make_toy
@@ -110,6 +111,12 @@ def test_wherever_a_sweep_is_dropped_it_ends_in_the_same_bits(folder, no_picture
     assert "finished before" in capsys.readouterr().out
     for name in RUNS:
         assert contents(folder / "out" / name) == contents(folder / "whole" / name)
+    # A line that a power cut has damaged does no harm; what is judged otherwise is judged anew.
+    with (folder / "out" / RUNS[0] / "metrics.csv").open("a") as file:
+        file.write("\0\0\n")
+    for kind, step in (("true", "finished"), ("false", "continue")):
+        more = ("evolution.strategy=SNES", f"evolution.passport={kind}")
+        assert next_step(Plan("a", 0, folder / "out" / RUNS[0], "toy.yaml", more)) == step
 
 
 @pytest.mark.slow

@@ -161,29 +161,6 @@ def test_gusts_move_a_heavy_body_less():
         assert np.abs(found.qvel[:, 3:]).max() < (0.05 if added_mass else 1e-12)
 
 
-@pytest.mark.slow
-def test_a_whole_rollout_does_not_know_how_fast_its_water_goes():
-    """Galilei: in a uniform current, moving along with it, an arm strokes as in still water."""
-    robot = arm_robot(world(**WATER))
-    current = np.array([0.3, -0.2, 0.05])
-    qpos, qvel = random_states(robot, 8, speed=0.3)
-    moving = qvel.copy()
-    moving[:3] += current[:, None]
-    ctrl = np.random.default_rng(2).uniform(-0.7, 0.7, (robot.num_hinges, 8))
-    zero = (np.float64(0),) * 3
-    time, q, v, work = march(robot, 1.0, qpos, qvel, ctrl, water=Water(0.0, zero), every=10)
-    _, other_q, other_v, other_work = march(
-        robot, 1.0, qpos, moving, ctrl, water=Water(0.0, tuple(current)), every=10
-    )
-    other_q, other_v = other_q.copy(), other_v.copy()
-    other_q[:, :3] -= time[:, None, None] * current[:, None]
-    other_v[:, :3] -= current[:, None]
-    assert np.abs(q[-1, 7:] - qpos[7:]).max() > 0.3
-    assert other_q == pytest.approx(q, abs=1e-9)
-    assert other_v == pytest.approx(v, abs=1e-8)
-    assert other_work == pytest.approx(work, abs=1e-9)
-
-
 def test_a_floating_box_goes_with_a_long_wave():
     """Its height is the surface's where it is, its velocity the water's, its deck level with it."""
     amplitude, length = 0.2, 40.0

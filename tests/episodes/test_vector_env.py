@@ -156,37 +156,17 @@ def test_observations_are_what_the_sensors_tell(env, fitness, episode):
     assert 0.05 < away.std() < 0.2
 
 
-@pytest.mark.slow
-def test_who_acts_as_the_sine_controller_scores_as_it_does(config, fitness):
-    key = jax.random.fold_in(jax.random.key(9), 0)
-    genes = jnp.array([1.5, 0.0, 0.0, np.pi / 2])
-    ctrl = np.asarray(fitness.replay(genes, key).ctrl)
-    low, high = fitness.robot.mj_model.actuator_ctrlrange.T
-    actions = ((ctrl - (low + high) / 2) / ((high - low) / 2))[:, actuators_of(fitness.robot)]
-    fast = make_vector_env(config, 1, control_rate=200)
-    found = run(fast, actions[:, None], seed=9)
-    score = float(fitness(genes[None], key)[0])
-    assert abs(score) > 1e-3
-    assert found[-1][-1]["score"][0] == pytest.approx(score, rel=1e-3)
-
-
 TASKS = {
     "speed": {
-        "task.current_std": 0.1,
-        "task.energy_weight": 0.01,
-        "world": {
-            "name": "lake",
-            "current": [0.1, 0.0, 0.0],
-            "gust": {"std": 0.1, "time": 1.0},
-            "waves": [{"amplitude": 0.05, "period": 2.0}],
-        },
+        "task.current_std": 0.1, "task.energy_weight": 0.01,
+        "world": {"name": "lake", "current": [0.1, 0.0, 0.0], "gust": {"std": 0.1, "time": 1.0},
+                  "waves": [{"amplitude": 0.05, "period": 2.0}]},
     },
     "reach_target": {
-        "task.target_distance": 1.0,
-        "task.target_speed": 0.1,
+        "task.target_distance": 1.0, "task.target_speed": 0.1,
         "sensors": ["bearing", {"type": "gyro", "rate": 10.0, "delay": 0.1}, "load"],
     },
-}
+}  # fmt: skip
 
 
 @pytest.mark.long

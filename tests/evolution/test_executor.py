@@ -1,6 +1,7 @@
 """Workers: the same bits whatever their number, and whatever happens to them."""
 
 import contextlib
+import datetime
 import json
 import os
 import pickle
@@ -117,21 +118,27 @@ def test_without_workers_or_blocks_a_pool_is_its_fitness():
 
 
 @pytest.fixture(scope="module")
-def crowd(tmp_path_factory):
-    """Three workers."""
-    config = toy_config(tmp_path_factory.mktemp("crowd"), population_size=10, generations=6)
-    with make_executor(config, 3, toys.make_toy) as executor:
-        yield config, executor
+def troubled(tmp_path_factory):
+    """Two workers, and a file that says what happens to one of them."""
+    folder = tmp_path_factory.mktemp("troubled")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TOY_TROUBLE", str(folder / "order"))
+        patch.setattr(jobs, "LIMITS", Limits(block=15.0, tries=2))
+        config = toy_config(folder, population_size=10, generations=6)
+        with make_executor(config, 2, toys.make_troubled) as executor:
+            executor(np.zeros((12, 5)), KEY)
+            yield executor, folder / "order"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 5, 33])
-def test_scores_do_not_depend_on_the_workers(crowd, size):
-    check_scores(crowd[1], size, size)
+def test_scores_do_not_depend_on_the_workers(troubled, size):
+    check_scores(troubled[0], size, size)
 
 
-def test_the_champion_does_not_depend_on_blocks(crowd):
-    config, executor = crowd
+def test_the_champion_does_not_depend_on_blocks(troubled):
+    executor, order = troubled
+    config = load_config(order.parent / "toy.yaml")
     whole = Executor(toys.Toy())
     evolutions = [GeneEvolution(config.evolution, each) for each in (executor, whole)]
     generations = config.evolution.generations
@@ -143,8 +150,8 @@ def test_the_champion_does_not_depend_on_blocks(crowd):
     assert champions[0].origin == champions[1].origin
 
 
-def test_workers_ignore_interrupts(crowd):
-    _, executor = crowd
+def test_workers_ignore_interrupts(troubled):
+    executor, _ = troubled
     for worker in executor.workers:
         worker.process.send_signal(signal.SIGINT)
         worker.process.send_signal(signal.SIGTERM)
@@ -164,6 +171,7 @@ def test_a_job_takes_all_files_along(tmp_path):
             f"task.type={tmp_path / 'mine.py'}:stay",
             f"world={tmp_path / 'sea.yaml'}",
             f"task.params.grid={tmp_path / 'grid.bin'}",
+            "task.params.gears={1: 0.5, since: 2026-11-29}",  # which JSON would change
         ],
     )
     job = make_job(config, read_back)
@@ -190,6 +198,7 @@ def read_back(config):
     assert world.current_field is not None
     code = Path(path).read_text().splitlines()[0]
     grid = Path(config.task.params["grid"]).read_bytes()
+    assert config.task.params["gears"] == {1: 0.5, "since": datetime.date(2026, 11, 29)}
     return Path(config.morphology).read_text(), code, world.name, grid
 
 
@@ -220,18 +229,6 @@ def test_one_compiles_and_the_others_wait():
         thread.join(20)
     assert entered == ["first", "first is done", "other", "other"]
     assert not together.broken
-
-
-@pytest.fixture(scope="module")
-def troubled(tmp_path_factory):
-    """Two workers, and a file that says what happens to one of them."""
-    folder = tmp_path_factory.mktemp("troubled")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TOY_TROUBLE", str(folder / "order"))
-        patch.setattr(jobs, "LIMITS", Limits(block=15.0, tries=2))
-        with make_executor(toy_config(folder), 2, toys.make_troubled) as executor:
-            executor(np.zeros((12, 5)), KEY)
-            yield executor, folder / "order"
 
 
 def pids_of(executor):

@@ -123,8 +123,11 @@ def test_the_largest_population_fits(tmp_path, folder, monkeypatch):
     assert memory.free_memory(tmp_path) == 8_192_000
     (group / "memory.max").write_text("5000000\n")
     assert memory.free_memory(tmp_path) == 4_000_000
+    # What the kernel keeps of files it gives back.
+    (group / "memory.stat").write_text("anon 5\ninactive_file 600000\nactive_file 100000\n")
+    assert memory.free_memory(tmp_path) == 4_700_000
     monkeypatch.setattr(memory, "free_memory", lambda: 4_000_000)
-    for strategy in ("SNES", "DifferentialEvolution"):
+    for strategy in ("SNES", "DE"):
         for size, fits in ((10**9, False), (None, True), (1, False)):
             if size == 10**9:
                 with pytest.raises(ValueError, match="expected at most") as caught:

@@ -15,7 +15,9 @@ import pytest
 import yaml
 from jax.experimental.compilation_cache import compilation_cache
 
+from laboratory import body
 from mjx_revolve.body.catalogue import load_modules
+from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.episodes.champion import load_genes
 from mjx_revolve.episodes.config import OLDER_WORLD, load_config, make_config, override_config
 from mjx_revolve.episodes.fitness import make_fitness
@@ -353,6 +355,23 @@ def test_a_run_writes_no_files_elsewhere_and_waits_for_none(run, tmp_path, name,
     found = "a link that leads out" if what == "link" else "something else"
     with pytest.raises(InputError, match=rf"{name}: expected a .+; found {found}$"):
         runs.open_run_folder(run.path)
+
+
+def test_no_genes_stand_beside_another_body(run, monkeypatch):
+    """Wherever it stops: where the disk is full after the body, there is no champion."""
+    run.save_champion(np.zeros(2), body("spider"), score=0.1)
+    write = run.write
+
+    def fill(name, content):
+        if name.endswith("genes.yaml"):
+            raise OSError(errno.ENOSPC, "full")
+        return write(name, content)
+
+    monkeypatch.setattr(type(run), "write", staticmethod(fill))
+    with pytest.raises(OSError, match="full"):
+        run.save_champion(np.ones(2), body("gecko"), score=0.2)
+    assert not (run.path / "champion" / "genes.yaml").exists()
+    assert load_morphology(run.path / "champion" / "morphology.yaml") == body("gecko")
 
 
 def test_champion_genes_come_back_bit_for_bit(run):

@@ -323,6 +323,7 @@ def test_a_plan_knows_more_with_each_motion(auv):
     plan = plan_motions(auv, ["drag", "thrust"], settings)
     assert len({m.words for m in plan.motions}) == 2
     assert (plan.spreads[1] < plan.spreads[0]).all()
+    assert all((m.recording.signals["z"].value == -1).all() for m in plan.motions)  # under water
     assert not plan.unknown
 
 
@@ -431,6 +432,45 @@ def test_marks_that_are_not_on_the_robot_are_refused(auv, tmp_path, columns, wor
         make_problem(auv, [recording], ["drag"], FitSettings())
 
 
+def test_marks_may_be_seen_one_at_a_time(auv, tmp_path):
+    """By two cameras in turn; what is too far from others of its own is not known."""
+    columns, where = marks(), read_map([f"mark.{k}=core:0,{MARKS[k][1]},0" for k in "ab"])
+    columns = {name: x for name, x in columns.items() if ".c." not in name}
+    for name, x in columns.items():
+        if name != "time":
+            x["b" in name :: 2] = np.nan
+    write_csv(tmp_path / "swim.csv", columns)
+    recording = load_recording(tmp_path / "swim.csv", auv, where)
+    problem = make_problem(auv, [recording], ["drag"], FitSettings(window=1.0))
+    begin = problem.begin + problem.piece * np.arange(len(problem.roots))
+    np.testing.assert_allclose(problem.roots[:, 0, 0], 0.2 * begin, atol=0.02)
+    for name, x in columns.items():
+        if name != "time":
+            x[30 * ("b" in name) :][:30] = np.nan
+    write_csv(tmp_path / "swim.csv", columns)
+    recording = load_recording(tmp_path / "swim.csv", auv, where)
+    with pytest.raises(InputError, match="expected two or more of them at a time; found never"):
+        make_problem(auv, [recording], ["drag"], FitSettings())
+
+
+def test_a_gap_of_the_heading_is_none_of_it(auv):
+    """Nothing is interpolated in it, and no window begins there."""
+    time = np.arange(300) / 30
+    lost = (time > 2) & (time < 6)
+    given = {"x": 0.2 * time, "y": 0 * time, "z": 0 * time - 1}
+    given = {n: TimeSeries(time, x) for n, x in given.items()}
+    given["yaw"] = TimeSeries(time[~lost], 0.1 * time[~lost])
+    settings = FitSettings(window=1.0, held_out=0.0)
+    problem = make_problem(auv, [RobotRecording("swim", given)], ["drag"], settings)
+    begun = problem.begin[0] + problem.piece * np.flatnonzero(problem.drive.resets[:, 0])
+    assert len(begun) > 4 and not ((begun > 2.2) & (begun < 5.8)).any()
+    [turned] = [channel for channel in problem.channels if channel.kind == "attitude"]
+    found = turned.residual(np.tile(np.eye(1, 13 + 0, 3), (1, len(turned.time), 1)))
+    known = np.isfinite(found).any((0, 2))
+    assert known[(turned.time < 2) | (turned.time > 6)].all()
+    assert not known[(turned.time > 2.2) & (turned.time < 5.8)].any()
+
+
 def test_errors_are_of_what_was_recorded():
     found, none = np.full((3, 3), np.nan), np.zeros(3, bool)
     found[1] = 0.2, 0.0, 0.0
@@ -469,6 +509,11 @@ def test_units_gaps_and_factors_of_columns(auv, tmp_path):
         load_recording(tmp_path / "swim.csv", auv, read_map(["time=frame*0.05", "x=px*1e"]))
     with pytest.raises(InputError, match=r"--map x: expected one of the columns .*found 'p\\nx'"):
         load_recording(tmp_path / "swim.csv", auv, read_map(["time=frame*0.05", "x=p\nx"]))
+    with pytest.raises(InputError, match="--map dpeth: expected the name of a signal"):
+        load_recording(tmp_path / "swim.csv", auv, read_map(["time=frame*0.05", "dpeth=z"]))
+    other = read_map(["time=frame*0.05", "x=px*0.002", "yaw=yaw_deg*-1"])  # a sign has no unit
+    found = load_recording(tmp_path / "swim.csv", auv, other).signals["yaw"].value
+    np.testing.assert_allclose(found, -swim()["yaw"][kept], atol=1e-9)
     given = read_map(["time=frame*0.05", "x=px*0.002"])
     found = load_recording(tmp_path / "swim.csv", auv, given)
     for name in ("x", "y", "yaw"):
@@ -506,6 +551,8 @@ def test_prescribed_hinges_follow_what_was_measured():
     names = [robot.morphology.modules[k].name for k in robot.morphology.hinges]
     angle = problem.states(track, 0, time)[0, :, 13 + names.index("left_hip")]
     np.testing.assert_allclose(angle, hip, atol=2e-3)
+    with pytest.raises(InputError, match=r"commands .* as they are free; found none of left_hip"):
+        make_problem(robot, [recording], ["servo_speed"], FitSettings())
     course = np.cumsum(np.random.default_rng(0).normal(size=20))
     assert course_targets(course, 0.01).shape == (18,)
 

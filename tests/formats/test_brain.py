@@ -15,7 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from exports import ODD
-from laboratory import check_refused, read
+from laboratory import body, check_refused, read
 from mjx_revolve.control.controller import Controller
 from mjx_revolve.control.readings import readings_at_rest
 from mjx_revolve.control.sensors import count_samples
@@ -367,6 +367,40 @@ def test_names_and_limits_are_those_of_the_robot():
     with pytest.raises(ValueError, match="expected 2; found 1"):
         given = {s.name: np.zeros(s.size) for s in brain.signals} | {"angle": [0.0]}
         run_python(text, brain, [given])
+
+
+def test_places_past_the_end_and_robots_without_hinges(spider):
+    """What lies past an end is what the operation says, and a sum over no hinges is 0."""
+    near = np.arange(1, 9)
+
+    def padded(parameters, state, time, sense):
+        some = sense.angle.at[near].get(mode="fill", fill_value=0.5)
+        return state, 0.1 * (some + jnp.where(near[:, None] < 8, jnp.take(sense.angle, near, 0), 0))
+
+    def steer(parameters, state, time, sense):
+        rows = sense.angle.shape[0]
+        felt = jnp.sum(sense.angle, 0) + (jnp.ones((1, rows)) @ sense.angle)[0]
+        return state, jnp.concatenate(
+            [2 * sense.angle, sense.up[0] + felt[None] + jnp.ones((4, 1))]
+        )
+
+    still = build_robot(body("auv"), load_world("lake"))
+    for robot, step, given, expected in (
+        (spider, padded, {"angle": near / 10}, 0.02 * np.append(near[1:], 2.5)),
+        (still, steer, {"up": np.array([-0.5, 0.0, 0.0])}, np.full(4, 0.5)),
+    ):
+        controller = Controller(0, (), lambda genes, plant: (), lambda parameters: (), step)
+        brain = make_brain(robot, controller, np.zeros(0), 20.0)
+        found = run_python(make_brain_python(brain), brain, [given])
+        np.testing.assert_allclose(found[0], expected, atol=1e-6)
+
+
+def test_a_single_command_is_a_list_of_one():
+    jet = read("body: {type: Core, children: {2: {type: Thruster}}}")
+    robot = build_robot(jet, load_world("lake"))
+    controller = CONTROLLERS["sine"].make(plant_of(robot).at_rate(20.0))
+    brain = make_brain(robot, controller, np.zeros(controller.num_genes), 20.0)
+    assert run_python(make_brain_python(brain), brain, [{}]).shape == (1, 1)
 
 
 @pytest.mark.parametrize(

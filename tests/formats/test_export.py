@@ -101,24 +101,18 @@ def test_command_writes_a_champions_controller(quick, capsys, monkeypatch, episo
 
 
 WRONG = [
-    (
-        ["a.yaml", "--mjcf", "a.txt"],
-        "--mjcf a.txt: expected a name that ends in .xml; found '.txt'",
-    ),
-    (
-        ["a.yaml", "--controller", "my-brain.py"],
-        "--controller my-brain.py: expected a name that Python can import (letters, digits and _)",
-    ),
+    (["a.yaml", "--mjcf", "a.txt"],
+     "--mjcf a.txt: expected a name that ends in .xml; found '.txt'"),
+    (["a.yaml", "--controller", "my-brain.py"],
+     "--controller my-brain.py: expected a name that Python can import (letters, digits and _)"),
     (["a.yaml", "--mjcf", "dir.xml"], "--mjcf dir.xml: expected a file; found a folder"),
     (["a.yaml", "--out", "b", "--sdf", "a.sdf"], "--out: expected a folder or single files; found"),
     (["a.yaml", "--duration", "nan"], "--duration: expected a number > 0 and <= 86400 [s]; found"),
     (["a.yaml", "--mjcf", "file/a.xml"], "--mjcf file/a.xml: expected the folder file; found a"),
-    (
-        ["a.yaml", "--mjcf", "a.xml", "--meshes", "x/"],
-        "--meshes: expected --urdf, --sdf or all formats; found neither",
-    ),
+    (["a.yaml", "--mjcf", "a.xml", "--meshes", "x/"],
+     "--meshes: expected --urdf, --sdf or all formats; found neither"),
     (["run", "--world", "lake"], "world: expected none: a champion swims in the world it evolved"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("arguments", "message"), WRONG)

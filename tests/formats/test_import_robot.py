@@ -234,6 +234,7 @@ def test_the_command_writes_what_other_commands_read(tmp_path, capsys, monkeypat
     "old, new, expected",
     [
 ("<robot", "<sdf", "expected XML; found: mismatched tag"),
+("\n<robot", '<?xml version="1.0" encoding="GB2312"?><robot', "expected XML; found: multi-byte"),
 ('"0.4"', '"heavy"', "<mass> value: expected 1 numbers; found 'heavy'"),
 ('"0.4"', '"0"', "base: expected a root with a mass; found none"),
 ('<child link="left"', '<child link="lft"', "joint hip: expected a link of the file; f"),

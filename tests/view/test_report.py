@@ -405,6 +405,17 @@ def test_the_command_prints_and_writes_a_passport(copy, monkeypatch, capsys):
         assert found.checks["drag"].value == value
     assert given[0] == (2, GENES.tolist(), 0)
 
+    def beaten(*_):
+        """The run goes on meanwhile, and has another champion."""
+        text = (copy / "champion" / "genes.yaml").read_text()
+        (copy / "champion" / "genes.yaml").write_text(text.replace("score: ", "score: 1"))
+        return found
+
+    monkeypatch.setattr("mjx_revolve.episodes.passport.make_passport", beaten)
+    assert run_command(passport.main, [str(copy)]) == 2
+    assert "the champion that was tried; found another" in capsys.readouterr().err
+    assert load_passport(copy / "champion" / "passport.yaml") == found
+
 
 def test_a_page_about_several_runs(lab, copy, quick, capsys):
     runs_of = [lab["folder"] / f"s{seed}" for seed in range(3)]

@@ -27,20 +27,6 @@ SENSORS = [
 KEY = jax.random.key(7)
 
 
-def config(folder, **changes):
-    if not (folder / "elbow.yaml").exists():
-        elbow_robot(world()).morphology.save(folder / "elbow.yaml")
-    data = {
-        "morphology": str(folder / "elbow.yaml"),
-        "world": {"name": "lake", "current": [0.1, 0.0, 0.0]},
-        "controller": {"type": "mlp", "hidden": 2, "messages": 0, "sensors": SENSORS},
-        "task": {"type": "directed_swim", "duration": 0.5, "settle": 0.0, "trials": 2,
-                 "start_yaw": 1.0},
-        "evolution": {"population_size": 4, "generations": 1, "passport": False},
-    }  # fmt: skip
-    return data | changes
-
-
 def echo(fitness):
     """The same with a brain whose targets are what it is told, all numbers in two sums."""
     plain = fitness.controller
@@ -66,7 +52,15 @@ def echo(fitness):
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory):
     """A fitness, an episode of it, and what was felt."""
-    fitness = echo(make_fitness(make_config(config(tmp_path_factory.mktemp("felt")))))
+    robot = tmp_path_factory.mktemp("felt") / "elbow.yaml"
+    elbow_robot(world()).morphology.save(robot)
+    config = make_config({
+        "morphology": str(robot), "world": {"name": "lake", "current": [0.1, 0.0, 0.0]},
+        "controller": {"type": "mlp", "hidden": 2, "messages": 0, "sensors": SENSORS},
+        "task": {"type": "directed_swim", "duration": 0.5, "settle": 0.0, "trials": 2,
+                 "start_yaw": 1.0},
+    })  # fmt: skip
+    fitness = echo(make_fitness(config))
     trajectory = jax.tree.map(np.asarray, fitness.replay(np.zeros(0), KEY, trial=1))
     return fitness, trajectory, trace_sensors(fitness, trajectory, KEY, trial=1)
 

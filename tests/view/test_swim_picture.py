@@ -151,14 +151,6 @@ def test_targets_are_drawn_or_pointed_at(small, name, target, words):
     assert set(said) == (set() if words is None else {name + words})  # marked in both views
 
 
-@pytest.mark.slow
-def test_rows_after_the_first_that_is_not_finite_are_left_out(small):
-    broken = swim(small)
-    broken.qpos[150:] = np.nan
-    short = trajectory(small, TIME[:150], broken.qpos[:150])
-    assert words_of(small, broken) == words_of(small, short)
-
-
 def test_a_single_row_is_a_portrait(elbow):
     said = words_of(elbow, trajectory(elbow, TIME[:1], swim(elbow).qpos[:1]))
     assert "elbow" in said  # a name without a speed

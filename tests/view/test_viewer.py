@@ -120,12 +120,10 @@ def test_bodies_are_where_mujoco_has_them(robots, name):
     qpos = poses(robot, 5)
     expected = pose_robot(robot, qpos)
     for row, q in enumerate(qpos):
-        found = bend(tree, q)
-        assert np.array([p for p, _ in found]) == pytest.approx(
-            expected.position[row, 1:], abs=1e-5
-        )
+        places, found = map(np.array, zip(*bend(tree, q), strict=True))
+        assert places == pytest.approx(expected.position[row, 1:], abs=1e-5)
         turns = np.array([rotation(quat) for quat in expected.quaternion[row, 1:]])
-        assert np.array([r for _, r in found]) == pytest.approx(turns, abs=1e-5)
+        assert found == pytest.approx(turns, abs=1e-5)
 
 
 def meshes_of(*robots):
