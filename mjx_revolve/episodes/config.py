@@ -136,9 +136,9 @@ class ControllerConfig(Section):
     targets jerk the servos, and steps of 5 ms are too long to resolve the jerks."""
     max_frequency: Annotated[Positive, Le(20), Unit("Hz")] = 2.0
     """Upper end of the gene for frequency, half of `rate` at most: of `sine` and `splines` the
-    common frequency, of `cpg` that of an uncoupled oscillator (coupled ones may be up to twice as
-    fast), of `sensory_cpg` that before feedback adds to it, of `mlp` and `rnn` that of the clock
-    among their inputs [Hz]."""
+    common frequency, of `cpg` that of an uncoupled oscillator (coupled ones may be faster), of
+    `sensory_cpg` that before feedback adds to it, of `mlp` and `rnn` that of the clock among their
+    inputs [Hz]."""
     amplitude: Annotated[Positive, Le(1), Unit("-")] = 1.0
     """Largest amplitude of each sine, as a share of half the hinge's range: 1 swings from end to
     end; the range clips their sum [-]."""
