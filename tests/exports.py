@@ -50,16 +50,17 @@ modules:
   Jets:
     mount: -x
     parts:
-      - {name: motor, size: [0.03, 0.03, 0.03], mass: 0.02, thruster: {position: [0.06, 0, 0]}}
+      - {name: motor, size: [0.03, 0.03, 0.03], mass: 0.02,
+         thruster: {gain: 0.5, position: [0.06, 0, 0]}}
       - {name: motor_propeller, size: [0.01, 0.02, 0.02], mass: 0.01, position: [0.04, 0, 0],
-         thruster: {gain: 2.0}}
+         thruster: {gain: 0.5}}
   Pod:
     mount: -x
     hinge: {axis: [0, 1, 0], anchor: [0.012, 0, 0]}
     parts:
       - {name: box, size: [0.02, 0.02, 0.02], mass: 0.01}
       - {name: box_2, size: [0.03, 0.02, 0.02], mass: 0.01, position: [0.04, 0, 0],
-         thruster: {gain: 1.0}}
+         thruster: {gain: 0.5}}
 body:
   {type: Core, id: core, children: {0: {type: Jets, id: jet/left}, 1: {type: Jets, id: jet/right},
    2: {type: Pod, id: core/lift}, 3: {type: Pod, id: pod, params: {mass: 0.03, volume: 5.0e-6}}}}

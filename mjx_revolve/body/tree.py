@@ -143,6 +143,17 @@ class Morphology:
         )
 
     @property
+    def thruster_names(self) -> tuple[str, ...]:
+        """Names of the thrusters' commands: their modules', where there is no other command."""
+        rows = [(self.modules[i], k) for i, k in self.thrusters]
+        return tuple(
+            m.name
+            if m.kind.hinge is None and sum(other is m for other, _ in rows) == 1
+            else f"{m.name}/{m.kind.parts[k].name}"
+            for m, k in rows
+        )
+
+    @property
     def num_thrusters(self) -> int:
         """Number of thrusters."""
         return len(self.thrusters)

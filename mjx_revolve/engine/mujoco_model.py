@@ -137,7 +137,7 @@ def _add_bodies(spec: mujoco.MjSpec, assembly: Assembly) -> None:
     """Bodies with their joints and servos, parts and thrusters, module by module."""
     [morphology], table = assembly.morphologies, assembly.fluid
     place, turn = assembly.from_parents()
-    bodies = [spec.worldbody]
+    bodies, names = [spec.worldbody], iter(morphology.thruster_names)
     row = 0
     for index, module in enumerate(morphology.modules):
         if index == 0:
@@ -154,7 +154,7 @@ def _add_bodies(spec: mujoco.MjSpec, assembly: Assembly) -> None:
             pose = table.position[row], table.rotation[row]
             _add_geoms(carrier, module, part, *pose, assembly.world)
             if part.thruster is not None:
-                _add_thruster(spec, carrier, module, part, *pose)
+                _add_thruster(spec, carrier, next(names), module, part, *pose)
             row += 1
 
 
@@ -196,26 +196,29 @@ def _add_hinge(spec: mujoco.MjSpec, assembly: Assembly, number: int, body: Any) 
 
 
 def _add_thruster(
-    spec: mujoco.MjSpec, body: Any, module: Module, part: Part, place: np.ndarray, turn: np.ndarray
+    spec: mujoco.MjSpec,
+    body: Any,
+    name: str,
+    module: Module,
+    part: Part,
+    place: np.ndarray,
+    turn: np.ndarray,
 ) -> None:
     """A thruster as stock MuJoCo can have it: a filtered force at a site, linear in the command.
 
     Our engines take lag and limits from here and thrust from the thruster's own curve, which
     MuJoCo cannot represent; its gain is the mean gradient of the curve over the command's range.
     """
-    thruster, name = part.thruster, f"{module.name}/{part.name}"
+    thruster, site = part.thruster, f"{module.name}/{part.name}"
     assert thruster is not None
-    # The module's name, where it is the only actuator there.
-    jets = [other for other in module.kind.parts if other.thruster is not None]
-    alone = module.kind.hinge is None and len(jets) == 1
     axis = turn @ np.asarray(thruster.axis)
-    body.add_site(name=name, pos=place + turn @ np.asarray(thruster.position))
+    body.add_site(name=site, pos=place + turn @ np.asarray(thruster.position))
     low, high = thruster.range
     ends = thruster_curve(thruster, np.array([low, high]))
     lag = thruster.time_constant > 0
     spec.add_actuator(
-        name=module.name if alone else name,
-        target=name,
+        name=name,
+        target=site,
         trntype=mujoco.mjtTrn.mjTRN_SITE,
         gear=[*axis, *(-thruster.torque_ratio * axis)],
         dyntype=mujoco.mjtDyn.mjDYN_FILTEREXACT if lag else mujoco.mjtDyn.mjDYN_NONE,

@@ -287,7 +287,7 @@ def plant_of(robot: Robot, order: Sequence[int] | None = None) -> Plant:
     body, (low, high, place, axis) = robot.morphology, read_actuators([robot.morphology])
     source = np.array(range(len(low)) if order is None else order, np.int32)
     row = np.argsort(source)
-    names = tuple(robot.mj_model.actuator(k).name for k in (*robot.servos, *robot.thrusters))
+    names = (*(body.modules[k].name for k in body.hinges), *body.thruster_names)
     pairs = body.hinge_neighbours()
     ends = np.array([(row[i], row[j]) for i, j in pairs], np.int32).reshape(-1, 2)
     return Plant(

@@ -450,10 +450,6 @@ class Config(Settings):
             raise ConstraintError("controller.type", what, "brain")
         if self.engine != "population":
             raise ConstraintError("engine", "population, as bodies evolve", self.engine)
-        seeds, size = len(self.bodies.seeds), self.evolution.population_size
-        if self.colony is None and seeds > size:
-            least = f"at least as many as bodies.seeds ({seeds})"
-            raise ConstraintError("evolution.population_size", least, size)
         if self.evolution.passport == "required":
             what = "true or false, as bodies evolve (bodies.selection.passport asks for it)"
             raise ConstraintError("evolution.passport", what, "required")

@@ -6,7 +6,6 @@ Imports stand inside functions: a worker's threads are set before NumPy and JAX 
 from __future__ import annotations
 
 import contextlib
-import json
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -151,7 +150,7 @@ def compile_job(job: Job, fitness: object) -> None:
     example = example_block(fitness, job.config["evolution"]["population_size"])
     lock: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
     if not job.keeps_programs:
-        name = hash_text(function_name(job.make_fitness), json.dumps(job.config, default=str))
+        name = hash_text(function_name(job.make_fitness), repr(job.config))
         lock = runtime.compile_lock("job", name)
     with lock:
         evaluate_block(fitness, example, jax.random.key(0))

@@ -438,6 +438,10 @@ def check_search(config: Config, executor: Executor) -> None:
     """
     try:
         make_evolution(config, executor)
+        size, seeds = config.evolution.population_size, config.bodies and len(config.bodies.seeds)
+        if seeds and config.colony is None and seeds > size:
+            least = f"at least as many as bodies.seeds ({seeds})"
+            raise InputError("evolution.population_size", least, size)
     except InputError as error:
         if str(error).startswith(("evolution.", "bodies.")):
             raise config.blame(error) from None

@@ -132,7 +132,10 @@ def _generations(run: RunFolder) -> int:
     """How many generations a run has done, by the lines that are whole; a run drops others."""
     if not run.metrics_path.exists():
         return 0
-    done = read_metrics(run.metrics_path).columns.get("generation")
+    table = read_metrics(run.metrics_path)
+    if table.damage:
+        raise InputError(f"{short_path(run.metrics_path)}: {table.damage}")
+    done = table.columns.get("generation")
     return 0 if done is None or not len(done) else int(done[-1])
 
 

@@ -119,8 +119,9 @@ def list_motions(robot: Robot, settings: FitSettings) -> list[PlannedMotion]:
     time = np.arange(0.0, settings.duration + 1e-9, 1 / settings.rate)
     modules = robot.morphology.modules
     hinges = [modules[k].name for k in robot.morphology.hinges]
-    parts = {modules[k].name: modules[k].kind.parts[i] for k, i in robot.morphology.thrusters}
-    jets = {n: part.thruster for n, part in parts.items() if part.thruster is not None}
+    parts = [modules[k].kind.parts[i].thruster for k, i in robot.morphology.thrusters]
+    named = zip(robot.morphology.thruster_names, parts, strict=True)
+    jets = {name: jet for name, jet in named if jet is not None}
     still = {n: TimeSeries(time, 0 * time) for n in ("x", "y", "yaw", "roll", "pitch")}
     still["z"] = TimeSeries(time, 0 * time + rest_height(robot))
     found: list[PlannedMotion] = []

@@ -53,7 +53,7 @@ class MarkPoints:
 
 
 def gap(time: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Whether times lie in a gap of a signal, farther from its rows than rows usually do.
+    """Whether times lie in a gap of a signal, farther from its rows than most rows do.
 
     Args:
         time: `[n]` of the rows, rising [s].
@@ -66,7 +66,8 @@ def gap(time: np.ndarray, at: np.ndarray) -> np.ndarray:
         return np.zeros(np.shape(at), bool)
     k = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
     away = np.minimum(np.abs(at - time[k - 1]), np.abs(at - time[k]))
-    return away > GAP * float(np.median(np.diff(time)))
+    # Rows may come in bursts.
+    return away > GAP * float(np.quantile(np.diff(time), 0.9))
 
 
 def joined_marks(time: np.ndarray, seen: np.ndarray, dims: int) -> np.ndarray:

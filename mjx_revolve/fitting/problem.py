@@ -356,7 +356,7 @@ def make_problem(
         raise InputError("--free", "at least one number of the robot", "none")
     names = [m.name for m in robot.morphology.modules]
     hinges = [names[k] for k in robot.morphology.hinges]
-    jets = [names[k] for k, _ in robot.morphology.thrusters]
+    jets = robot.morphology.thruster_names
     servos_free = any(p.name.startswith("servo") for p in parameters)
     prescribed = _prescribed(recordings, hinges, servos_free)
     views = [_View(robot, r, hinges) for r in recordings]
@@ -559,9 +559,7 @@ class _View:
                 for n in ("yaw", "pitch", "roll")
             ]
             self.quat = Rotation.from_euler("ZYX", np.stack(turns, -1)).as_quat(scalar_first=True)
-            for n in ("yaw", "pitch", "roll"):
-                if n in signals:
-                    self.quat[gap(signals[n].time, self.time)] = np.nan
+            self.quat[gap(signals["yaw"].time, self.time)] = np.nan
             self.level = "roll" not in signals
         if self.names:
             self._fit_marks()

@@ -137,16 +137,18 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
     for name in rest:
         if not _SIGNAL.fullmatch(name) and not (bag and name in _TYPES):
             raise InputError(f"--map {name}", "the name of a signal", show(name))
+    notes: list[str] = []
     with reading(path):
         if run:
-            signals = _mapped(_read_run(path), rest)
+            signals, notes = _mapped(_read_run(path), rest)
         elif bag:
-            signals = _read_bag(path, rest)
+            signals, notes = _read_bag(path, rest)
         else:
             signals, unused = _read_csv(path, rest, robot)
         _add_marks(marks, signals, robot)
-        notes = _check_signals(signals, robot)
-    uncommanded = [m.name for m in robot.morphology.modules if m.kind.hinge or m.kind.is_thruster]
+        notes += _check_signals(signals, robot)
+    body = robot.morphology
+    uncommanded = [*(body.modules[k].name for k in body.hinges), *body.thruster_names]
     uncommanded = [n for n in uncommanded if not {f"command.{n}", f"angle.{n}"} & set(signals)]
     if uncommanded:
         notes.append(f"no commands of {', '.join(uncommanded)}: taken to be 0")
@@ -156,19 +158,26 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
 
 
 def _mapped(
-    signals: dict[str, TimeSeries], columns: Mapping[str, str], topics: Sequence[str] = ()
-) -> dict[str, TimeSeries]:
-    """With the signals that a map takes from others of them, as `z=z*-1`."""
-    found = dict(signals)
+    signals: dict[str, TimeSeries], columns: Mapping[str, str]
+) -> tuple[dict[str, TimeSeries], list[str]]:
+    """With the signals that a map takes from others of them, as `y=y*-1`, or that are numbers.
+
+    Sources that others of a study's recordings may have are left out, with a note.
+    """
+    found, notes = dict(signals), []
     for name, source in columns.items():
-        match = _SOURCE.match(source)
+        match, number = _SOURCE.match(source), _finite(source)
         assert match is not None
-        if match["column"] not in signals:
-            known = ", ".join([*signals, *topics])
-            raise InputError(f"--map {name}", f"one of {known}, also with *FACTOR", show(source))
-        time, value = signals[match["column"]]
-        found[name] = TimeSeries(time, _factor(name, match["factor"] or "1") * value)
-    return found
+        if match["column"] in signals:
+            time, value = signals[match["column"]]
+            found[name] = TimeSeries(time, _factor(name, match["factor"] or "1") * value)
+        elif number is not None and name != "time":
+            time = max((one.time for one in signals.values()), key=len)
+            found[name] = TimeSeries(time, np.full(len(time), number))
+        else:
+            known = ", ".join(signals)
+            notes.append(f"--map {name}: there is no {show(source)}, but {known}: left out")
+    return found, notes
 
 
 def _read_mark(key: str, source: str, robot: Robot) -> MarkedPoint:
@@ -257,7 +266,7 @@ def _name_columns(
         column, factor = match["column"], match["factor"]
         if column in header:
             scale = _factor(name, factor) if factor else 1.0
-            if column != name and abs(scale) == 1.0:  # a sign leaves the unit as it is
+            if column != name and (not factor or scale == -1.0):  # a sign leaves the unit as it is
                 scale *= _unit(column)[1]
             found[name] = header.index(column), scale
             continue
@@ -321,8 +330,8 @@ def _unit(column: str) -> tuple[str, float]:
 # --- bags and run folders -------------------------------------------------------------------------
 
 
-def _read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, TimeSeries]:
-    """Topics by their types; of several poses the first, or what `odometry=/topic` names.
+def _read_bag(path: Path, columns: Mapping[str, str]) -> tuple[dict[str, TimeSeries], list[str]]:
+    """Topics by their types, and notes; of several poses the first, or that of `odometry=/topic`.
 
     Of several of another type it is the same; but all of joints, points (marks, by the last of
     their topics' names) and numbers (`depth`, or what `command.port=/topic*FACTOR` names) are read.
@@ -334,36 +343,23 @@ def _read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, TimeSeries]:
     store: Any = get_typestore(Stores.ROS2_HUMBLE)
     kept: dict[str, list[tuple[float, float]]] = {}
     chosen: dict[str, str] = {}
-    named = {}
-    for name, source in columns.items():
-        match = _SOURCE.match(source)
-        assert match is not None
-        named[match["column"]] = name, _factor(name, match["factor"] or "1")
     try:
         with Reader(path) as bag:
-            topics = {c.topic: c.msgtype.rpartition("/")[2] for c in bag.connections}
-            read = {
-                name for name, source in columns.items()
-                if (name in _TYPES and topics.get(source) == _TYPES[name])
-                or topics.get(source.partition("*")[0]) in _NUMBERS
+            kinds = {c.topic: c.msgtype.rpartition("/")[2] for c in bag.connections}
+            picked = {
+                _role(_TYPES[name]): source for name, source in columns.items()
+                if name in _TYPES and _role(kinds.get(source, "")) == _role(_TYPES[name])
             }  # fmt: skip
             for connection, stamp, raw in bag.messages():
                 kind, topic = connection.msgtype.rpartition("/")[2], connection.topic
                 if (use := _TOPICS.get(kind)) is None:
                     continue
-                # All poses are of the core: one topic has them.
-                alike = _POSES if kind in _POSES else (kind,)
-                wanted = [columns[x.lower()] for x in alike if x.lower() in columns]
-                role = f"{kind} {topic}" if kind in _MANY else alike[0]
-                if chosen.setdefault(role, wanted[0] if wanted else topic) != topic:
+                role = f"{kind} {topic}" if kind in _MANY else _role(kind)
+                if chosen.setdefault(role, picked.get(role, topic)) != topic:
                     continue
                 message = store.deserialize_cdr(raw, connection.msgtype)
                 for name, value in use(message, topic):
-                    name, factor = (
-                        named.get(topic, (name, 1.0)) if kind in _NUMBERS else (name, 1.0)
-                    )
-                    if name:
-                        kept.setdefault(name, []).append((1e-9 * stamp, factor * float(value)))
+                    kept.setdefault(name, []).append((1e-9 * stamp, float(value)))
     except InputError:
         raise
     except Exception as error:  # rosbags' own kinds, struct's, zstd's
@@ -371,15 +367,27 @@ def _read_bag(path: Path, columns: Mapping[str, str]) -> dict[str, TimeSeries]:
         raise InputError(f"expected a ROS 2 bag; found: {found_instead}") from None
     if not kept:
         raise InputError(f"expected topics of the types {', '.join(_TOPICS)}; found none")
-    first = min(rows[0][0] for rows in kept.values())
     found = {}
     for name, rows in kept.items():
         time, value = np.array(rows).T
         order = np.argsort(time, kind="stable")
         once = np.append(True, np.diff(time[order]) > 0)
-        found[name] = TimeSeries(time[order][once] - first, value[order][once])
-    others = {name: source for name, source in columns.items() if name not in read}
-    return _mapped(found, others, list(topics))
+        found[name] = TimeSeries(time[order][once], value[order][once])
+    # Numbers are named by the map, or by their topic's end.
+    sources = {source.rpartition("*")[0] or source for source in columns.values()}
+    depth = [n for n in found if n.endswith("/depth") and n not in sources]
+    if depth and "depth" not in columns:
+        found["depth"] = found[depth[0]]
+    rest = {n: x for n, x in columns.items() if n not in _TYPES or _role(_TYPES[n]) not in picked}
+    found, notes = _mapped(found, rest)
+    found = {name: one for name, one in found.items() if name not in kinds}
+    first = min((one.time[0] for one in found.values()), default=0.0)
+    return {n: TimeSeries(one.time - first, one.value) for n, one in found.items()}, notes
+
+
+def _role(kind: str) -> str:
+    """Of a type of messages: all poses are of the core, and one topic has them."""
+    return "pose" if kind in _POSES else kind
 
 
 def _pose(pose: Any) -> Iterable[tuple[str, float]]:
@@ -410,7 +418,7 @@ def _point(message: Any, topic: str) -> Iterable[tuple[str, float]]:
 
 
 def _number(message: Any, topic: str) -> Iterable[tuple[str, float]]:
-    yield ("depth" if topic.rpartition("/")[2] == "depth" else ""), message.data
+    yield topic, message.data
 
 
 _TOPICS: dict[str, Callable[[Any, str], Iterable[tuple[str, float]]]] = {
@@ -470,7 +478,10 @@ def _add_marks(
 
 def _check_signals(signals: Mapping[str, TimeSeries], robot: Robot) -> list[str]:
     """Plain faults, one line each; and notes about gaps."""
-    modules = {m.name: m.kind for m in robot.morphology.modules}
+    body = robot.morphology
+    hinges = [body.modules[k].name for k in body.hinges]
+    parts = [body.modules[i].kind.parts[k].thruster for i, k in body.thrusters]
+    jets = dict(zip(body.thruster_names, parts, strict=True))
     seen = [n for n in signals if n in _POSE or n in _SENSED or n.startswith("mark.")]
     if not any(n in ("x", "mean_speed") or n.startswith("mark.") for n in signals):
         raise InputError("expected x and y of the core, marks, or mean_speed; found none of them")
@@ -493,26 +504,24 @@ def _check_signals(signals: Mapping[str, TimeSeries], robot: Robot) -> list[str]
         head, _, module = name.partition(".")
         if head not in ("command", "angle"):
             continue
-        kind = modules.get(module)
-        if kind is None or (kind.hinge is None and not (kind.is_thruster and head == "command")):
-            which = [m for m, k in modules.items() if k.hinge is not None or k.is_thruster]
+        if module not in (hinges if head == "angle" else {*hinges, *jets}):
+            known = ", ".join([*hinges, *jets]) or "it has none"
             raise InputError(
-                f"{name}: expected a hinge or thruster of {robot.morphology.name} "
-                f"({', '.join(which) or 'it has none'}); found {show(module)}: another robot?"
+                f"{name}: expected a hinge or thruster of {body.name} ({known}); found "
+                f"{show(module)}: another robot?"
             )
         most = float(np.abs(signal.value).max())
-        if kind.hinge is not None and most > 2 * math.pi:
+        if module in hinges and most > 2 * math.pi:
             raise InputError(
                 f"{name}: expected radians; found {most:.3g}: degrees? (--map "
                 f"{name}=COLUMN*0.01745, or a column that ends in _deg)"
             )
-        if kind.hinge is None:
-            jet = next(p.thruster for p in kind.parts if p.thruster is not None)
-            if most > 3 * max(map(abs, jet.range)):
-                raise InputError(
-                    f"{name}: expected commands within {list(jet.range)}; found {most:.3g}: "
-                    f"percent? (--map {name}=COLUMN*0.01)"
-                )
+        jet = jets.get(module)
+        if jet is not None and most > 3 * max(map(abs, jet.range)):
+            raise InputError(
+                f"{name}: expected commands within {list(jet.range)}; found {most:.3g}: percent? "
+                f"(--map {name}=COLUMN*0.01)"
+            )
     if all(name in signals for name in quat):
         length = np.sqrt(sum(np.median(signals[name].value ** 2) for name in quat))
         if not 0.5 < length < 1.5:

@@ -23,6 +23,7 @@ from mjx_revolve.evolution.executor import Executor
 from mjx_revolve.evolution.generations import run_generations
 from mjx_revolve.evolution.individuals import features, from_record, to_record
 from mjx_revolve.evolution.learning import evaluate_again, learn, score_brains
+from mjx_revolve.evolution.run import check_search
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from toys import CLOCK, make_toy_bodies
@@ -93,6 +94,8 @@ def test_learning_improves_and_is_what_counts(folder):
         assert individual.trials == 48 and individual.brain in [n.brain for n in naive]
     with pytest.raises(InputError, match=r"^bodies.learning.strategy: expected one of"):
         founders(*start(folder, {"learning": {"strategy": "guess"}}))
+    with pytest.raises(InputError, match=r"population_size: .* as many as bodies.seeds"):
+        check_search(*start(folder, {"seeds": ["spider"] * 7, "max_modules": 20, "max_hinges": 8}))
     # Scored by itself, what was learnt gives the score again, on the same starts.
     wide = np.zeros((len(learned), 1, executor.num_genes), np.float32)
     for row, individual in zip(wide, learned, strict=True):

@@ -16,7 +16,6 @@ from mjx_revolve.fitting.axes import find_other_axes
 from mjx_revolve.fitting.problem import FitSettings, make_problem
 from mjx_revolve.fitting.recording import read_map
 from mjx_revolve.inputs.commands import run_command
-from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.world import load_world
 
 FREE = ["drag", "thrust"]
@@ -198,8 +197,10 @@ def test_a_bag_of_either_kind_as_a_folder_and_as_a_file(fit, auv, signals, tmp_p
     known, *others = (load_recording(path, auv, columns).signals for path in paths)
     upside = load_recording(file, auv, columns | {"y": "y*-1"}).signals["y"]
     np.testing.assert_array_equal(upside.value, -known["y"].value)
-    with pytest.raises(InputError, match=r"--map depth: expected one of x, .*; found '/sonar'"):
-        load_recording(file, auv, {"depth": "/sonar"})
+    shared = {"depth": "1.5", "mark.bow.x": "px*0.002"}  # the latter is for another recording
+    found = load_recording(file, auv, columns | shared)
+    assert (found.signals["depth"].value == 1.5).all() and "mark.bow.x" not in found.signals
+    assert found.notes[0].startswith("--map mark.bow.x: there is no 'px*0.002', but ")
     for other in others:
         assert known.keys() == other.keys()
         for name, one in known.items():
