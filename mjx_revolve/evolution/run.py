@@ -97,7 +97,7 @@ class Run:
 
     @property
     def is_finished(self) -> bool:
-        """Whether it has all its generations and its champion already, chosen by the passport of now."""
+        """Whether it has all generations and its champion, chosen by the passport of now."""
         done = self.generation >= self.config.evolution.generations
         known = self.folder.load_config().evolution.passport
         return done and "finished" in self.folder.info and known == self.config.evolution.passport
