@@ -279,7 +279,8 @@ def _name_columns(
         found[name] = None, number
         if name == "time":
             raise InputError("--map time", "a column", f"the number {source}")
-    modules = [m.name for m in robot.morphology.modules]
+    body = robot.morphology
+    modules = list(dict.fromkeys([*(m.name for m in body.modules), *body.thruster_names]))
     twice = [column for column in header if header.count(column) > 1]
     if twice:
         raise InputError(f"column {twice[0]}", "each name once", "it twice")
