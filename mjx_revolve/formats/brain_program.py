@@ -334,13 +334,7 @@ class Builder:
                 grids.append(np.arange(first, first + size, dtype=np.int32).reshape(shape))
                 first += size
                 continue
-            data = self.values[number].data
-            if data is None:
-                raise InputError(
-                    "controller: expected constant places in arrays; found JAX's "
-                    f"{name!r} at places that its step computes"
-                )
-            grids.append(data.reshape(shape))
+            grids.append(self._places(number, name).reshape(shape))
         if name in _INDEXERS:
             made: Any = _INDEXERS[name](grids, params, outs[0])
         else:
@@ -349,16 +343,21 @@ class Builder:
         sources = [args[k] for k in moved]
         return [self.take(sources, np.asarray(x)) for x in found]
 
+    def _places(self, number: int, name: str) -> np.ndarray:
+        """Constant places in an array, for such an operation."""
+        data = self.values[number].data
+        if data is None:
+            raise InputError(
+                "controller: expected constant places in arrays; found JAX's "
+                f"{name!r} at places that its step computes"
+            )
+        return np.asarray(data)
+
     def _gather_or_fill(
         self, equation: Any, args: list[int], shapes: list[tuple[int, ...]]
     ) -> list[int]:
         """Elements at constant places; those past the end are what the operation fills in."""
-        where, size = self.values[args[1]].data, self.values[args[0]].size
-        if where is None:
-            raise InputError(
-                "controller: expected constant places in arrays; found JAX's 'gather' at places "
-                "that its step computes"
-            )
+        where, size = self._places(args[1], "gather"), self.values[args[0]].size
         params, dtype = equation.params, equation.outvars[0].aval.dtype
         grid = np.arange(size, dtype=np.int32).reshape(shapes[0])
         params = {**params, "fill_value": size}
