@@ -104,6 +104,7 @@ CASES = (
         "26 bodies with 64 learners each, ellipsoid law", "", _WEIGHTLESS, beside=True,
         steps=_SHORT[:3], bodies=26, learners=64,
     ),
+    Case("spider, default water, gusts", "spider", {"world": _LAKE}),
     Case(
         "spider, default water, gusts, sensors at 20 Hz", "spider",
         {"world": _LAKE, "controller": _SENSES},
