@@ -20,8 +20,8 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
 def long_ones(path):
-    """What evolves with workers, draws pages or differentiates takes a quarter of a minute."""
-    long = path.stem[:2] in ("10", "11", "12", "16")
+    """What evolves, draws pages, differentiates or learns takes a quarter of a minute."""
+    long = path.stem[:2] in ("04", "05", "08", "10", "11", "12", "13", "16")
     return pytest.param(path, marks=pytest.mark.long if long else pytest.mark.slow)
 
 

@@ -43,7 +43,7 @@ def test_plates_lift_as_measured_before_they_stall():
     assert 1.5 < ratios(polars.rows)["lift, aspect 2, 25°"] < 1.9
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_chain_glides_as_far_as_measured():
     found = ratios(measured_cases.amphibot_glide().rows)
     assert all(abs(x - 1) < 0.04 for name, x in found.items() if "way" in name)

@@ -117,7 +117,7 @@ def test_hinges_that_reverse_together_do_not_push_each_other_far_beyond_the_top_
     assert np.quantile(ratio[:, there], 0.5) > 0.3  # they do move
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_light_limbs_come_to_rest_after_jumps_of_their_targets():
     """At 20 ms, with springs that an explicit step could not hold.
 

@@ -93,6 +93,7 @@ OTHERS = sorted(set(STRATEGIES) - {find_strategy(name) for name in QUICK})
 
 
 @pytest.mark.slow
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize("name", [*QUICK, *OTHERS])
 def test_strategies_reach_the_optimum_or_get_nearer(name):
     within = 0.05 if name in QUICK else 1.0 if name in WEAK else 0.2
