@@ -198,6 +198,12 @@ def evolve_brain(brain: Any, genes: Any, source: str = "robot") -> Any:
         A new network: with genes of 0 it acts as the given one does with `genes`.
     """
     network, made = read_neural_network(brain, source), copy.deepcopy(brain)
+    # What a file's aliases share is changed for each by itself.
+    for key, value in made.items():
+        if key == "connections":
+            made[key] = [dict(one) for one in value or ()]
+        elif key == "params":
+            made[key] = {neuron: dict(own or {}) for neuron, own in (value or {}).items()}
     params = {str(key): value for key, value in (made.get("params") or {}).items()}
     folded = np.sin(np.asarray(genes, float))
     for (kind, which), x in zip(_genes_of(network), folded, strict=True):

@@ -367,8 +367,8 @@ def mate(colony: Colony, trajectory: TankTrajectory, rules: Rules) -> tuple[Colo
     ready = [
         number
         for number, member in members.items()
-        if now - member.born >= mating.adult
-        and member.busy_until <= now
+        if now - member.born >= mating.adult - 1e-9
+        and member.busy_until <= now + 1e-9
         and member.individual.score > 0
     ]
     if len(ready) < 2:

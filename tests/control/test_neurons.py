@@ -123,7 +123,11 @@ def test_what_has_evolved_is_saved_and_runs_the_same(robot, tmp_path):
     assert play(again, None, 200, felt()) == pytest.approx(expected, abs=1e-12)
     assert np.abs(expected - play(robot, None, 200, felt())).max() > 0.1
     assert "amplitude" not in brain["params"]["clock"]  # written as it was
-    assert robot.morphology.brain["params"]["mix"]["bias"] == 0.1  # which stays as it is
+    params = robot.morphology.brain["params"]
+    assert params["mix"]["bias"] == 0.1  # which stays as it is
+    shared = robot.morphology.brain | {"params": params | {"sum": params["mix"]}}  # YAML's alias
+    made = evolve_brain(shared, genes)["params"]
+    assert made["mix"]["bias"] != made["sum"]["bias"]
 
 
 def changed(pattern, text):

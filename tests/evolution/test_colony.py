@@ -110,7 +110,7 @@ def test_mating(fitness, rules):
     assert event["id"] == 0 and event["other"] == 1 and event["place"] == [0.15, 0, -1]
     # While it gestates, 1 does not mate; then with 2, as 0 and 1 have had their two.
     assert parents(mate(mated, trajectory._replace(time=trajectory.time + 2), rules)[0]) == [(1, 0)]
-    later = {n: replace(m, busy_until=-1.0) for n, m in members.items()}
+    later = {n: replace(m, busy_until=10.0 + 1e-12) for n, m in members.items()}
     later[0], later[1] = (replace(later[a], children={b: 2}) for a, b in ((0, 1), (1, 0)))
     assert parents(mate(Colony(members=later), trajectory, rules)[0]) == [(1, 2)]
     # Robots of 2 s do not mate, nor does any where all slots are promised.
