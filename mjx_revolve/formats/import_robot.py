@@ -75,8 +75,9 @@ def import_robot(path: str | Path) -> ImportedRobot:
     """Makes a robot of a URDF or an MJCF file.
 
     Masses, centres, inertias and hinges are the file's. A link displaces the volume of its visible
-    shapes where these are closed, else that of those that collide, which are its boxes: cylinders,
-    spheres and meshes as the boxes around them. Servos are position servos as all here.
+    shapes, a mesh with holes that of the box around it; without any, that of those that collide,
+    which are its boxes: cylinders, spheres and meshes as the boxes around them. Servos are
+    position servos as all here.
 
     Args:
         path: of the file.

@@ -237,7 +237,8 @@ def _measures(members: Numbered) -> str:
     """Means and intervals of all measures of champions."""
     everything = [o for found in members.values() for o in found]
     bodies = {name for o in everything if o.body is not None for name in o.body.descriptors}
-    fixed = {name for name in bodies if len({o.champion[name] for o in everything}) == 1}
+    known = [o for o in everything if o.body is not None]
+    fixed = {name for name in bodies if len({o.champion[name] for o in known}) == 1}
     names = dict.fromkeys(name for o in everything for name in o.champion)
     rows = [
         [label_of(name), *(str(interval(_values(found, name))) for found in members.values())]
