@@ -29,6 +29,8 @@ from mjx_revolve.water.bed import highest_bed
 
 # At birth, robots are further apart than the sum of their radii times this. A choice.
 _CLEARANCE = 1.0
+# By which times that are sums of steps may fall short [s].
+_ROUNDING = 1e-9
 CAUSES = ("age", "energy", "lost", "failed")
 """Causes of death: age, an empty battery, the arena's end, a state that is not finite."""
 
@@ -339,7 +341,7 @@ def _cause_of_death(
     if member.charge <= 0:
         return "energy"
     span = life_span(member.individual.score, rules.colony.life)
-    return "age" if age >= span - 1e-9 else None
+    return "age" if age >= span - _ROUNDING else None
 
 
 def wrap_edges(colony: Colony, rules: Rules) -> tuple[Colony, np.ndarray]:
@@ -367,8 +369,8 @@ def mate(colony: Colony, trajectory: TankTrajectory, rules: Rules) -> tuple[Colo
     ready = [
         number
         for number, member in members.items()
-        if now - member.born >= mating.adult - 1e-9
-        and member.busy_until <= now + 1e-9
+        if now - member.born >= mating.adult - _ROUNDING
+        and member.busy_until <= now + _ROUNDING
         and member.individual.score > 0
     ]
     if len(ready) < 2:
@@ -436,7 +438,7 @@ def give_birth(
     events: list[Event] = []
     for pending in colony.pending_births:
         placed = None
-        if pending.due <= time + 1e-9 and len(colony.members) < rules.slots:
+        if pending.due <= time + _ROUNDING and len(colony.members) < rules.slots:
             child = make_child(
                 rules.fitness, rng, colony.next_number, colony.generation, *pending.parents,
                 both_brains=True,
