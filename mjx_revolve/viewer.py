@@ -92,17 +92,16 @@ def main(argv: list[str] | None = None) -> int:
 
 def _write_colony(arguments: argparse.Namespace) -> int:
     """Writes the page of a whole colony."""
-    folder = Path(arguments.path)
+    from mjx_revolve.episodes.run_reader import find_run
+
+    folder = find_run(arguments.path)
     out = Path(arguments.out) if arguments.out else _usual_path(folder, "colony", "colony")
     from mjx_revolve.view.colony import DURATION, record_colony
 
     runtime.prepare_process()
     with opening_episode(arguments):
         seen = record_colony(folder, arguments.time, arguments.duration or DURATION)
-    written = write_colony_page(
-        seen.robots, out, seen.title, marks=seen.marks, leap=seen.leap,
-        window=(seen.start, seen.end),
-    )  # fmt: skip
+    written = write_colony_page(seen.robots, out, seen.title, marks=seen.marks, leap=seen.leap)
     span = f"{len(seen.robots)} robots, {seen.start:.4g} to {seen.end:.4g} s"
     print(plain(f"{short_path(out)}: {span}, {written.bytes / 1e6:.2f} MB; open it in a browser"))
     return 0

@@ -18,7 +18,7 @@ import numpy as np
 
 from mjx_revolve.body.morphology import trim_neutral
 from mjx_revolve.engine.robot import Robot, build_robot
-from mjx_revolve.episodes.config import Config
+from mjx_revolve.episodes.config import Config, TaskConfig
 from mjx_revolve.episodes.early_checks import read_episode_file, refuse_world
 from mjx_revolve.episodes.fitness import (
     Fitness,
@@ -56,6 +56,7 @@ class Episode:
         water: surface and current at each row; None: the world's.
         genes: `[G]` or None without a controller.
         fitness: of the run, or None.
+        task: of the run, or None.
         folder: the run folder, or None.
         starts: those over which the score is the mean, in words.
     """
@@ -68,6 +69,7 @@ class Episode:
     water: Water | None = None
     genes: np.ndarray | None = None
     fitness: Fitness | None = None
+    task: TaskConfig | None = None
     folder: Path | None = None
     starts: str = "fresh starts"
 
@@ -76,7 +78,7 @@ class Episode:
     @property
     def length(self) -> float:
         """Body length, as the run's task has it [m]."""
-        return body_length(self.robot, self.fitness.settings if self.fitness else None)
+        return body_length(self.robot, self.task)
 
 
 def load_episode(
@@ -178,7 +180,8 @@ def _episode(
     config: Config, name: str, robot: Robot, trajectory: Trajectory, **more: Any
 ) -> Episode:
     """An episode of a run."""
-    facts = {"score_unit": score_unit(config.task.type, config.task.unit)} | more
+    unit = score_unit(config.task.type, config.task.unit)
+    facts: dict[str, Any] = {"score_unit": unit, "task": config.task} | more
     return Episode(
         f"{name}: {config.task.name.replace('_', ' ')}", robot, trajectory,
         folder=Path(config.source).parent.absolute(), **facts,

@@ -23,6 +23,7 @@ from mjx_revolve.view.plots import (
     ORANGE,
     WIDE,
     curve_with_band,
+    format_number,
     in_style,
     label_of,
     legend_outside,
@@ -97,8 +98,14 @@ def plot_best(folder: Path, modules: Mapping[str, ModuleType], title: str = "") 
     for axes, picture, life in zip(grid.flat, pictures, best, strict=False):
         axes.imshow(picture, interpolation="lanczos")
         look: dict[str, Any] = {"ha": "center", "va": "top", "transform": axes.transAxes}
-        score = f"{life.score:.3g}".replace("-", "\u2212")
-        axes.text(0.5, -0.01, f"{life.number}: {score}", fontsize=9.5, color=INK, **look)
+        axes.text(
+            0.5,
+            -0.01,
+            f"{life.number}: {format_number(life.score)}",
+            fontsize=9.5,
+            color=INK,
+            **look,
+        )
         axes.text(0.5, -0.12, count_modules(life), fontsize=8.5, color="#5b6a75", **look)
     return figure
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+from mjx_revolve.episodes.run_reader import find_run
 from mjx_revolve.evolution.colony_observer import ObservedRobot, observe_colony, open_colony
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.recording import Mark, Recording, ReplayRobot
@@ -26,7 +27,7 @@ def record_colony(
     Up to the run's end the recording equals the run; from there on the colony is continued.
 
     Args:
-        folder: the run folder; it stays as it is.
+        folder: the run folder, or its `champion` folder; it stays as it is.
         begin: where the recording begins [s]; None: at the newest checkpoint.
         duration: how long it is [s].
 
@@ -36,6 +37,7 @@ def record_colony(
     Raises:
         InputError: it is no run of a colony, it has no checkpoint, or no robot is alive then.
     """
+    folder = find_run(folder)
     config, fitness, search, begin = open_colony(folder, begin)
     colony = config.colony
     assert colony is not None

@@ -74,8 +74,7 @@ def episode_data(episode: Episode, forces: bool = True) -> Packed:
     low = float((parts[..., 2] - np.linalg.norm(robot.fluid.half_size, axis=1)).min())
     now = water_at(world, rows, time, len(trajectory.time), water)
     current = water_velocity(world, now, center)
-    task = episode.fitness.config.task if episode.fitness else None
-    target = target_of(task, trajectory)
+    target = target_of(episode.task, trajectory)
     surface, begun = (_first(x) for x in (water.surface_height, water.time))
     net, lowest = qpos[-1, :2] - qpos[0, :2], float(qpos[:, 2].min())
     moved = float(np.linalg.norm(net)) > 0.05 * length
@@ -97,7 +96,7 @@ def episode_data(episode: Episode, forces: bool = True) -> Packed:
             "drift": pack_floats(water_drift(world, now, center, step)),
             "current": moving if is_moving(current) else None,
             "target": None if target is None else pack_floats(target[rows]),
-            "target_name": target_name(task),
+            "target_name": target_name(episode.task),
             "anchors": _anchors(robot),
             "forces": _arrows(episode, every, water) if forces else _no_arrows(_LEFT_OUT),
             "deepest": max(1.3 * (surface - lowest), surface - low, 1.5 * length),

@@ -247,11 +247,12 @@ def replay_data(
         for one in robots
     ]
     places = np.concatenate([np.asarray(one.qpos, float)[:, :3] for one in robots])
+    begin = min(round(one.appears, 4) for one in robots)
     ends = [float(one.end) for one in robots if one.end is not None]
     return {
         "size": float(np.median([one.robot.morphology.length for one in robots])),
-        "begin": min(round(one.appears, 4) for one in robots),
-        "last": max([*ends, *(float(one.time[-1]) for one in robots)]),
+        "begin": begin,
+        "last": max([begin, *ends, *(float(one.time[-1]) for one in robots)]),
         "low": places.min(0).tolist(),
         "high": places.max(0).tolist(),
         "floor": floor,

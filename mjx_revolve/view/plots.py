@@ -35,6 +35,7 @@ BLUE, ORANGE, GREEN = COLORS[:3]
 INK, GREY, PALE, DEEP = "#222222", "#6b7680", "#b9c6cf", "#0b3c5d"
 # Axis labels of the measures.
 LABELS = {name: f"{m.words} ({m.unit.replace('-', '–')})" for name, m in MEASURES.items()}
+NO_VALUE = "–"
 WIDE = 9.0  # width of most figures [inches]
 _DASHES: tuple[str | tuple, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
 
@@ -66,6 +67,13 @@ def label_of(name: str) -> str:
 def with_unit(words: str, unit: str) -> str:
     """A name and its unit, where there is one."""
     return f"{words} ({unit})" if unit else words
+
+
+def format_number(value: float | None, digits: int = 3) -> str:
+    """A number to so many digits, with a true minus; `–` where there is none."""
+    if value is None or not np.isfinite(value):
+        return NO_VALUE
+    return f"{value:.{digits}g}".replace("-", "−")
 
 
 def style_of(index: int) -> dict[str, Any]:

@@ -123,10 +123,9 @@ def _headline(motion: Motion) -> str:
 def _facts(motion: Motion) -> str:
     """Distance and time while it counts."""
     begun = motion.time[motion.first]
-    when = f"from {begun:.3g} s on" if motion.first else "getting under way included"
     lengths = motion.distance / motion.length
     way = f"one episode: {motion.distance:.2g} m ({lengths:.2g} body lengths)"
-    return f"{way} in {motion.seconds:.3g} s, {when}"
+    return f"{way} in {motion.seconds:.3g} s, from {begun:.3g} s on"
 
 
 def _axes_at(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:

@@ -177,7 +177,7 @@ def _fit(
 
     times = [np.asarray(one.time, float) for one in robots]
     qpos = [np.asarray(one.qpos, float) for one in robots]
-    gap, total = _CLOSEST, sum(map(len, times))
+    gap, total, before = _CLOSEST, sum(map(len, times)), -1
     usual = max((float(np.median(np.diff(t))) for t in times if len(t) > 1), default=0.0)
     for _ in range(_TRIES):
         rows = [_thin(time, gap, window) for time in times]
@@ -185,8 +185,9 @@ def _fit(
         kept_qpos = [x[own] for x, own in zip(qpos, rows, strict=True)]
         packed = pack_poses(kept_times, kept_qpos, _STEPS)
         count, size = sum(map(len, rows)), len(packed["poses"])
-        if size <= room:
+        if size <= room or count == before:  # what is left is in the window
             break
+        before = count
         gap = max(gap, usual) * max(1.1, size / room)
     return count, gap if count < total else 0.0, packed
 

@@ -135,13 +135,13 @@ def make_film(episode: Episode, size: tuple[int, int] = (640, 480), fps: int = 3
     robot, world = episode.robot, episode.robot.world
     episode, lost = finite_rows(episode)
     rows = np.asarray(episode.trajectory.time, float)
-    # Times are multiples of the step from the start, which is one step before the first row.
+    # Rows are equally spaced, and the start is one such interval before the first.
     time = np.arange(max(1, round(float(rows[-1]) * fps))) / fps
     qpos = interpolate_poses(rows, np.asarray(episode.trajectory.qpos), time)
     parts = pose_robot(robot, qpos).parts
     center, radius = enclosing_balls(parts, np.linalg.norm(robot.fluid.half_size, axis=1))
     period = stroke_period(time, qpos[:, 7:])
-    before = np.round(time / world.timestep).astype(int) - 1
+    before = np.round(time / rows[0]).astype(int) - 1
     water = water_at(world, before, time, len(rows), episode.water)
     shots = plan_shots(
         time,
@@ -157,14 +157,13 @@ def make_film(episode: Episode, size: tuple[int, int] = (640, 480), fps: int = 3
     if episode.score is not None:
         score = f"score {episode.score:.3g} {episode.score_unit}".rstrip()
         score += f", mean over {episode.starts}"
-    task = None if episode.fitness is None else episode.fitness.config.task
-    target = target_of(task, episode.trajectory)
+    target = target_of(episode.task, episode.trajectory)
     if target is not None:
         target = np.stack([np.interp(time, rows, x) for x in target[: len(rows)].T], axis=-1)
     notes = EpisodeNotes(
         score, episode.length, smooth_path(time, center, period), radius,
         speed_over(time, qpos[:, :3], period), water_velocity(world, water, center), target,
-        target_name(task),
+        target_name(episode.task),
     )  # fmt: skip
     shown = FilmRobot(robot, qpos, np.ones(len(time), bool))
     origin = (center.min(axis=0) + center.max(axis=0)) / 2

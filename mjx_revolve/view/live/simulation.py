@@ -23,7 +23,7 @@ import numpy as np
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.live.commands import Command, Current, Drop, Pause, Rate, Remove, Reset
-from mjx_revolve.view.page_data import RobotMeshes, pack_waves
+from mjx_revolve.view.page_data import RobotMeshes
 from mjx_revolve.view.surroundings import bed_at
 from mjx_revolve.water.world import World
 
@@ -189,7 +189,6 @@ class LiveSimulation:
             "speed": round(self._speed, 3),
             "current": [*self.current],
             "busy": round(self.busy, 1),
-            "waves": pack_waves(self.world),
         }
         return _event("state", state)
 

@@ -13,24 +13,16 @@ from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.episodes.scoring import REPORT_EPISODES
 from mjx_revolve.view.colony_history import ColonyHistory
 from mjx_revolve.view.colony_pictures import cause_styles
-from mjx_revolve.view.plots import LABELS, label_of, with_unit
+from mjx_revolve.view.plots import LABELS, NO_VALUE, format_number, label_of, with_unit
 from mjx_revolve.view.report.champion import ChampionReplay
 from mjx_revolve.view.report.groups import RunGroup, differences
 from mjx_revolve.view.report.record import RunRecord, number
 from mjx_revolve.view.statistics import difference, interval
 
-_NO_VALUE = "–"
 # Stands behind the number of a champion that fails its passport.
 _FAILS = "✗"
 Cell = str | int
 """Of a table."""
-
-
-def format_number(value: float | None, digits: int = 3) -> str:
-    """A number to so many digits, with a true minus; `–` where there is none."""
-    if value is None or not np.isfinite(value):
-        return _NO_VALUE
-    return f"{value:.{digits}g}".replace("-", "−")
 
 
 def _measure(record: RunRecord, name: str) -> float | None:
@@ -41,7 +33,7 @@ def _measure(record: RunRecord, name: str) -> float | None:
 def _score(record: RunRecord) -> str:
     score, std = (number(record.champion.get(key)) for key in ("score", "score_std"))
     if score is None or not record.is_finished:
-        return _NO_VALUE
+        return NO_VALUE
     failed = record.passport is not None and record.passport.failed
     spread = "" if std is None else f" ± {format_number(std, 2)}"
     return format_number(score) + spread + (f" {_FAILS}" if failed else "")
@@ -100,7 +92,7 @@ def _of_run(record: RunRecord, unit: str) -> list[tuple[str, str]]:
         own = unit if record.history is None else ", fitness in the colony"
         pairs.append((format_number(record.metrics["champion"][-1]), f"best so far{own}"))
     for name in (record.measure, "cost_of_transport"):
-        if value := _measure(record, name):
+        if (value := _measure(record, name)) is not None:
             pairs.append((format_number(value), label_of(name)))
     return [*pairs, (str(record.generations), f"{record.round}s"), ("1", "seed")]
 
@@ -160,7 +152,7 @@ def _task_table(members: Sequence[tuple[int, RunGroup]]) -> TaskTable:
     rows: list[list[Cell]] = []
     for index, group in members:
         scores = group.scores()
-        less = _NO_VALUE if group is first else str(difference(scores, first.scores()))
+        less = NO_VALUE if group is first else str(difference(scores, first.scores()))
         measures = [[_measure(r, name) for r in group.records if r.is_finished] for name in known]
         rows.append([
             index, group.name, len(scores), str(interval(scores)),
@@ -177,7 +169,7 @@ def different_settings(groups: Sequence[RunGroup]) -> list[list[object]]:
     if not all(group.settings for group in groups):
         return []
     found = differences(groups).items()
-    return [[key, *(_NO_VALUE if value is None else value for value in row)] for key, row in found]
+    return [[key, *(NO_VALUE if value is None else value for value in row)] for key, row in found]
 
 
 def runs_table(groups: Sequence[RunGroup]) -> tuple[list[str], list[list[Cell]]]:
@@ -194,11 +186,11 @@ def runs_table(groups: Sequence[RunGroup]) -> tuple[list[str], list[list[Cell]]]
         planned = record.setting("evolution.generations")
         short = isinstance(planned, int) and planned != record.generations
         rows.append([
-            k, record.label, _NO_VALUE if record.seed is None else record.seed,
+            k, record.label, NO_VALUE if record.seed is None else record.seed,
             f"{record.generations} of {planned}" if short else record.generations, _score(record),
             *(format_number(_measure(record, name)) for name in known),
-            _NO_VALUE if seconds is None else f"{seconds / 60:.1f}",
-            str(record.champion.get("origin", _NO_VALUE))[:60],
+            NO_VALUE if seconds is None else f"{seconds / 60:.1f}",
+            str(record.champion.get("origin", NO_VALUE))[:60],
             record.state or "whole",
         ])  # fmt: skip
     return header, rows
@@ -246,7 +238,7 @@ def _edges(size: Iterable[float], digits: int = 3) -> str:
 def list_descriptors(morphology: Morphology) -> list[list[str]]:
     """Rows of a robot's descriptors: name, value, unit."""
     return [
-        [name.replace("_", " "), format_number(value, 4), UNITS[name].replace("-", _NO_VALUE)]
+        [name.replace("_", " "), format_number(value, 4), UNITS[name].replace("-", NO_VALUE)]
         for name, value in morphology.descriptors.items()
     ]
 

@@ -150,9 +150,8 @@ class Live extends Page {
     for (const name in acts) events.addEventListener(name, ({ data }) => acts[name](JSON.parse(data)));
   }
 
-  takeState({ paused, rate, speed, current, waves, busy }) {
+  takeState({ paused, rate, speed, current, busy }) {
     Object.assign(this, { paused, rate, speed });
-    waves.forEach((wave, k) => Object.assign(this.world.waves[k] ?? {}, wave));
     this.playing(!paused, paused ? "go on" : "pause");
     byId("rate").value = String(rate);
     if (busy) this.wait(`compiling… ${busy.toFixed(0)} s`);
@@ -237,7 +236,7 @@ class Live extends Page {
     if (!this.holding) byId("lift").value = z;
     if (this.arrow && velocity.join() === this.flow.join()) return;
     this.flow = velocity;
-    if (this.arrow) stage.scene.remove(this.arrow.group);
+    if (this.arrow) stage.scene.remove(this.arrow.group), release(this.arrow.group);
     // Longer where it is faster, as far as that can be seen.
     const scale = (0.6 * size * Math.min(1, Math.sqrt(all / FASTEST))) / Math.max(all, 1e-9);
     this.arrow = makeCurrent({ values: velocity }, scale, 1, size);

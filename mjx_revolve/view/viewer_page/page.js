@@ -169,7 +169,8 @@ class Page {
   // Follows the next one in the list, or the one before.
   step(by) {
     const keys = this.robots.living.map(({ key }) => key).sort((a, b) => a - b);
-    if (keys.length) this.follow(keys[(keys.indexOf(this.followed) + by + keys.length) % keys.length]);
+    const at = keys.includes(this.followed) ? keys.indexOf(this.followed) : Math.min(-by, 0);
+    if (keys.length) this.follow(keys[(at + by + keys.length) % keys.length]);
   }
 
   // The name and the facts of the robot that is followed; facts may hold several times.

@@ -86,7 +86,7 @@ class EpisodeParts {
       time: `${time.toFixed(2)} s`,
       [this.speedName]: {
         text: `${v.toFixed(3)} m/s`, more: `${(v / this.length).toFixed(2)} body lengths/s`,
-        title: "over ground, mean over one stroke",
+        title: "over ground, mean over one stroke, or one second without strokes",
       },
       depth: { text: `${depth.toFixed(2)} m`, title: "of the core's centre below the still surface" },
       "from start": `${Math.hypot(place.x - start[0], place.y - start[1], place.z - start[2]).toFixed(2)} m`,
@@ -288,7 +288,7 @@ class Replay extends Page {
     super.follow(key);
     if (this.trail) {
       this.stage.scene.remove(this.trail.group);
-      this.trail.dispose();
+      release(this.trail.group);
     }
     const actor = this.actors[key ?? (this.data.many ? null : 0)];
     this.trail = actor ? actor.track.trail() : null;

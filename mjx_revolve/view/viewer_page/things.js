@@ -166,6 +166,11 @@ function makeDust(size) {
 
 // --------------------------------------------------------------------- forces, current, target
 
+// Frees what a group keeps on the graphics card.
+function release(group) {
+  group.traverse((thing) => (thing.geometry?.dispose(), thing.material?.dispose(), thing.dispose?.()));
+}
+
 // Copies of a geometry, drawn twice: as they are, and faintly through what hides them.
 function makeCopies(geometry, color, count, group) {
   const Kind = THREE.InstancedMesh, uniforms = { uColor: new THREE.Vector3(...color), uThick: 0 };
@@ -201,7 +206,7 @@ function makeTrail(points, step, leap = Infinity) {
     lay(past, k, a, shown ? b.normalize() : UPWARDS, shown, shown * length);
   }
   group.add(past, all);
-  return { group, show: (time) => (past.count = Math.min(Math.max(Math.ceil(time / step), 0), count)), dispose: () => bar.dispose() };
+  return { group, show: (time) => (past.count = Math.min(Math.max(Math.ceil(time / step), 0), count)) };
 }
 
 // Arrows of one kind of force, one for each anchor on a robot; `scale` is metres per newton.
