@@ -25,6 +25,7 @@ from mjx_revolve.evolution.jobs import WorkerError
 from mjx_revolve.inputs.commands import (
     Parser,
     add_run_arguments,
+    check_no_fit,
     check_run_arguments,
     describe_refusal,
     program,
@@ -183,6 +184,7 @@ def _check(arguments: argparse.Namespace, files: bool) -> Config:
     if path is not None:
         find_shipped(path, "configs")  # a name that there is not is known at once
     found = check_run_folder(folder) / "config.yaml"
+    check_no_fit(folder)
     with opening(folder, *([path] if path else []), trust=arguments.trust):
         return load_config(found, () if path else arguments.settings)
 

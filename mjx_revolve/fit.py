@@ -182,21 +182,22 @@ def _finish(run: FitRun, interrupts: Interrupts) -> int:
 
 def describe(fit: Fit) -> list[str]:
     """What a fit has found, in lines."""
-    from mjx_revolve.fitting.problem import NOISE
+    from mjx_revolve.fitting.problem import LOCAL_UNITS, NOISE
 
     lines = []
     for v in fit.values:
         unit = v.unit or "times what it was"
         ends = f"[{v.low:.4g}, {v.high:.4g}]" if v.found else "(not found by itself)"
         lines.append(f"{v.name}: {v.value:.4g} {unit} {ends}")
-    lines += [f"{r}: {n} {x:.3g} ± {s:.2g}" for r, n, x, s in fit.local]
+    for r, n, x, s in fit.local:
+        lines.append(f"{r}: {n} {x:.3g} ± {1.96 * s:.2g} {LOCAL_UNITS[n.partition('_')[0]]}")
     lines += [f"{u.words}: the recordings do not determine more" for u in fit.unknown]
     for p in fit.predictions:
         held = bool(p.held.any())
-        what = "held out" if held else "fitted"
+        what, unit = "held out" if held else "fitted", "m/s" if p.is_speed else "m"
         lines.append(
-            f"{p.name}, {what}: {p.error(p.fitted, held):.3g} off (before: "
-            f"{p.error(p.before, held):.3g})" + (f", of a way of {p.way:.3g}" if p.way else "")
+            f"{p.name}, {what}: {p.error(p.fitted, held):.3g} {unit} off (before: "
+            f"{p.error(p.before, held):.3g})" + (f", of a way of {p.way:.3g} m" if p.way else "")
         )
     for kind, sigma in fit.estimate.noise.items():
         if sigma > _MUCH * NOISE[kind]:

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_revolve.episodes.config import Config, load_config
-from mjx_revolve.inputs.commands import check_no_sweep
+from mjx_revolve.inputs.commands import check_no_fit, check_no_sweep
 from mjx_revolve.inputs.errors import InputError, reading, show
 from mjx_revolve.inputs.files import SWEEP, check_path, read_file
 from mjx_revolve.inputs.schema import Number, TupleOf, read
@@ -39,6 +39,7 @@ def find_run(path: str | Path) -> Path:
     if folder.name == "champion" and not (folder / "config.yaml").is_file():
         folder = folder.parent
     check_no_sweep(folder)
+    check_no_fit(folder)
     if not (folder / "config.yaml").is_file():
         found = (
             "no config.yaml in it" if folder.is_dir() else "a file" if folder.exists() else "none"
@@ -57,6 +58,7 @@ def check_runs(names: Sequence[str | Path]) -> None:
         if not check_path(name).is_dir():
             found = "a file" if Path(name).exists() else "none"
             raise InputError(name, "a run folder", found)
+        check_no_fit(name)
     files = ("config.yaml", "run.json", "metrics.csv", "champion", SWEEP)
     folders = [f for f in map(Path, names) for f in (f, f.parent)]
     if not any((folder / file).exists() for folder in folders for file in files):

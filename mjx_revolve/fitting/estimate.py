@@ -314,9 +314,8 @@ def begin(problem: FitProblem, seed: int) -> FitState:
             starts[:, 5, problem.free_heading] = 2 * np.pi * k / (room + 1)
             points.append(replace(origin, starts=starts))
     else:
-        wanted = min(room, problem.settings.draws * room)
         points += [
-            replace(origin, free=spread * draw.normal(size=len(spread))) for _ in range(wanted)
+            replace(origin, free=spread * draw.normal(size=len(spread))) for _ in range(room)
         ]
     none = np.zeros(problem.drive.resets.shape)
     costs = recording_costs(problem, points, noise)

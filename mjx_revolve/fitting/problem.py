@@ -80,7 +80,6 @@ class FitSettings:
         held_out: share of the recordings, or of each one's end where there are fewer than four,
             that nothing is fitted to.
         iterations: at most.
-        draws: of the prior; the search begins at the best of them.
         duration: of a planned motion [s].
         motions: how many are planned.
         rate: of frames in a planned recording [Hz].
@@ -89,7 +88,6 @@ class FitSettings:
     window: Annotated[Number, Gt(0)] = 4.0
     held_out: Annotated[Number, Ge(0), Lt(1)] = 0.25
     iterations: Annotated[Integer, Ge(1), Le(200)] = 30
-    draws: Annotated[Integer, Ge(0)] = 1
     duration: Annotated[Number, Gt(0)] = 8.0
     motions: Annotated[Integer, Ge(1), Le(20)] = 4
     rate: Annotated[Number, Gt(0)] = 30.0

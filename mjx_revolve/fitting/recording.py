@@ -21,6 +21,7 @@ import numpy as np
 
 from mjx_revolve.engine.plant import body_geometry
 from mjx_revolve.engine.robot import Robot
+from mjx_revolve.formats.links import make_links, plain
 from mjx_revolve.inputs.errors import InputError, reading, show
 from mjx_revolve.inputs.files import check_path, read_file
 from mjx_revolve.inputs.packages import check_package
@@ -140,9 +141,9 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
     notes: list[str] = []
     with reading(path):
         if run:
-            signals, notes = _mapped(_read_run(path), rest)
+            signals, notes = _mapped(_read_run(path), rest, robot)
         elif bag:
-            signals, notes = _read_bag(path, rest)
+            signals, notes = _read_bag(path, rest, robot)
         else:
             signals, unused = _read_csv(path, rest, robot)
         _add_marks(marks, signals, robot)
@@ -158,18 +159,23 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
 
 
 def _mapped(
-    signals: dict[str, TimeSeries], columns: Mapping[str, str]
+    signals: dict[str, TimeSeries], columns: Mapping[str, str], robot: Robot
 ) -> tuple[dict[str, TimeSeries], list[str]]:
     """With the signals that a map takes from others of them, as `y=y*-1`, or that are numbers.
 
-    Sources that others of a study's recordings may have are left out, with a note.
+    Sources that others of a study's recordings may have are left out, with a note; joints of
+    another name than the module that has them go to that module alone.
     """
-    found, notes = dict(signals), []
+    found, notes, body = dict(signals), [], robot.morphology
+    modules = {*(m.name for m in body.modules), *body.thruster_names}
     for name, source in columns.items():
         match, number = _SOURCE.match(source), _finite(source)
         assert match is not None
         if match["column"] in signals:
             time, value = signals[match["column"]]
+            head, _, joint = match["column"].partition(".")
+            if head in ("command", "angle") and joint not in modules:
+                found.pop(match["column"], None)
             found[name] = TimeSeries(time, _factor(name, match["factor"] or "1") * value)
         elif number is not None and name != "time":
             time = max((one.time for one in signals.values()), key=len)
@@ -201,10 +207,11 @@ def _read_csv(
     """Signals by name, and the columns that are none."""
     text = read_file(path).decode("utf-8-sig")
     try:
-        rows = list(csv.reader(io.StringIO(text, newline=None)))
+        reader = csv.reader(io.StringIO(text, newline=None))
+        numbered = [(reader.line_num, row) for row in reader if any(map(str.strip, row))]
     except csv.Error as error:
         raise InputError(f"expected a CSV; found: {error}") from None
-    rows = [row for row in rows if any(cell.strip() for cell in row)]
+    lines, rows = [line for line, _ in numbered], [row for _, row in numbered]
     if not rows:
         raise InputError("expected a line of column names and rows of numbers; found an empty file")
     header = [cell.strip() for cell in rows[0]]
@@ -215,14 +222,14 @@ def _read_csv(
     values = np.full((len(rows) - 1, len(header)), np.nan)
     for k, row in enumerate(rows[1:]):
         if len(row) != len(header):
-            raise InputError(f"row {k + 2}", f"{len(header)} cells", len(row))
+            raise InputError(f"row {lines[k + 1]}", f"{len(header)} cells", len(row))
         for j, cell in enumerate(row):
             if cell.strip():
                 try:
                     values[k, j] = float(cell)
                 except ValueError:
                     raise InputError(
-                        f"row {k + 2}, column {header[j]}", "a number", show(cell)
+                        f"row {lines[k + 1]}, column {header[j]}", "a number", show(cell)
                     ) from None
     named = _name_columns(header, columns, robot)
     if "time" not in named:
@@ -236,13 +243,13 @@ def _read_csv(
     time = scale * values[:, column]
     if not np.isfinite(time).all():
         bad = int(np.flatnonzero(~np.isfinite(time))[0])
-        raise InputError(f"row {bad + 2}, column {header[column]}", "a time", "none")
+        raise InputError(f"row {lines[bad + 1]}, column {header[column]}", "a time", "none")
     steps = np.diff(time)
     if np.any(steps <= 0):
         late = int(np.flatnonzero(steps <= 0)[0]) + 1
         word = "goes back" if steps[late - 1] < 0 else "stands still"
         raise InputError(
-            f"row {late + 2}: expected a time later than {time[late - 1]:g} s; found "
+            f"row {lines[late + 1]}: expected a time later than {time[late - 1]:g} s; found "
             f"{time[late]:g} s: time {word}"
         )
     found = {}
@@ -288,14 +295,14 @@ def _name_columns(
     for k, column in enumerate(header):
         head, _, rest = column.partition(".")
         own = head in ("command", "angle") and rest in modules  # also one that ends like a unit
-        plain, factor = (column, 1.0) if own else _unit(column)
-        plain = {"t": "time"}.get(plain, plain)
-        if mark := re.fullmatch(r"([xyz])(\d+)", plain):
-            plain = f"mark.{mark[2]}.{mark[1]}"
-        head, _, rest = plain.partition(".")
-        known = plain == "time" or plain in _POSE or plain in _SENSED or head == "mark"
-        if plain not in found and (known or (head in ("command", "angle") and rest in modules)):
-            found[plain] = k, factor
+        bare, factor = (column, 1.0) if own else _unit(column)
+        bare = {"t": "time"}.get(bare, bare)
+        if mark := re.fullmatch(r"([xyz])(\d+)", bare):
+            bare = f"mark.{mark[2]}.{mark[1]}"
+        head, _, rest = bare.partition(".")
+        known = bare == "time" or bare in _POSE or bare in _SENSED or head == "mark"
+        if bare not in found and (known or (head in ("command", "angle") and rest in modules)):
+            found[bare] = k, factor
         elif head in ("command", "angle") and rest not in modules and k not in mapped:
             raise InputError(
                 f"column {column}: expected a module of {robot.morphology.name} "
@@ -331,7 +338,9 @@ def _unit(column: str) -> tuple[str, float]:
 # --- bags and run folders -------------------------------------------------------------------------
 
 
-def _read_bag(path: Path, columns: Mapping[str, str]) -> tuple[dict[str, TimeSeries], list[str]]:
+def _read_bag(
+    path: Path, columns: Mapping[str, str], robot: Robot
+) -> tuple[dict[str, TimeSeries], list[str]]:
     """Topics by their types, and notes; of several poses the first, or that of `odometry=/topic`.
 
     Of several of another type it is the same; but all of joints, points (marks, by the last of
@@ -341,6 +350,11 @@ def _read_bag(path: Path, columns: Mapping[str, str]) -> tuple[dict[str, TimeSer
     from rosbags.rosbag2 import Reader
     from rosbags.typesys import Stores, get_typestore
 
+    # What we export has names that ROS takes.
+    modules = {plain(name): name for name in robot.morphology.thruster_names}
+    for link in make_links(robot):
+        if link.joint is not None:
+            modules[link.joint.name] = robot.mj_model.body(link.body).name
     store: Any = get_typestore(Stores.ROS2_HUMBLE)
     kept: dict[str, list[tuple[float, float]]] = {}
     chosen: dict[str, str] = {}
@@ -360,6 +374,9 @@ def _read_bag(path: Path, columns: Mapping[str, str]) -> tuple[dict[str, TimeSer
                     continue
                 message = store.deserialize_cdr(raw, connection.msgtype)
                 for name, value in use(message, topic):
+                    head, dot, joint = name.partition(".")
+                    if head in ("command", "angle"):
+                        name = head + dot + modules.get(joint, joint)
                     kept.setdefault(name, []).append((1e-9 * stamp, float(value)))
     except InputError:
         raise
@@ -380,7 +397,7 @@ def _read_bag(path: Path, columns: Mapping[str, str]) -> tuple[dict[str, TimeSer
     if depth and "depth" not in columns:
         found["depth"] = found[depth[0]]
     rest = {n: x for n, x in columns.items() if n not in _TYPES or _role(_TYPES[n]) not in picked}
-    found, notes = _mapped(found, rest)
+    found, notes = _mapped(found, rest, robot)
     found = {name: one for name, one in found.items() if name not in kinds}
     first = min((one.time[0] for one in found.values()), default=0.0)
     return {n: TimeSeries(one.time - first, one.value) for n, one in found.items()}, notes

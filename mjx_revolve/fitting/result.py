@@ -74,7 +74,8 @@ class Prediction:
     @property
     def way(self) -> float:
         """Length of the recorded way, in steps of a tenth of it [m]."""
-        rows = np.linspace(0, len(self.time) - 1, 11).astype(int)
+        known = np.flatnonzero(np.isfinite(self.recorded).any(1))
+        rows = known[np.linspace(0, len(known) - 1, 11).astype(int)] if len(known) else known
         steps = np.diff(self.recorded[rows], axis=0)
         return float(np.sqrt(np.nansum(steps**2, 1)).sum())
 

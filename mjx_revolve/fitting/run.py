@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import yaml
+from annotated_types import Ge
 
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.coefficients import correct_modules, load_coefficients
@@ -23,17 +24,32 @@ from mjx_revolve.fitting.estimate import FitState, Model, advance, begin, linear
 from mjx_revolve.fitting.problem import FitProblem, FitSettings, Point, make_problem
 from mjx_revolve.fitting.recording import MarkedPoint, RobotRecording, TimeSeries
 from mjx_revolve.fitting.result import Fit, conclude, is_done
-from mjx_revolve.inputs.errors import InputError, show
+from mjx_revolve.inputs.errors import InputError, reading, show
 from mjx_revolve.inputs.files import read_file, write_atomic
 from mjx_revolve.inputs.overrides import read_overrides
-from mjx_revolve.inputs.schema import read
+from mjx_revolve.inputs.schema import Integer, Text, TupleOf, checked, read
 from mjx_revolve.inputs.shipped import find_shipped, list_shipped
 from mjx_revolve.inputs.yaml_reader import dump_yaml, load_yaml
 from mjx_revolve.numerics import runtime
+from mjx_revolve.water.currents import find_field
 from mjx_revolve.water.world import load_world, read_world_files
 
 # Of a state, what a checkpoint has as plain values.
 _PLAIN = ("noise", "common", "cost", "moved", "inflated")
+
+
+@checked
+class _FitFile:
+    """A fit's `config.yaml`; paths are relative to its folder."""
+
+    robot: Text
+    world: Text
+    free: TupleOf[Text]
+    seed: Annotated[Integer, Ge(0)]
+    settings: dict[Text, Any]
+    recordings: Text
+    modules: Text | None = None
+    world_fields: dict[Text, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -121,7 +137,11 @@ def load_robot(
     if modules is not None:
         copies["modules.yaml"] = read_file(modules)
         entry["modules"] = "inputs/modules.yaml"
-    entry["world_fields"] = overrides | dict(fields)
+    given = overrides | dict(fields)
+    if isinstance(grid := given.get("current_field"), str):
+        copies[f"field/{Path(grid).name}"] = read_file(find_field(grid, Path.cwd()))
+        given["current_field"] = f"inputs/field/{Path(grid).name}"
+    entry["world_fields"] = given
     return build_robot(body, water), entry, copies
 
 
@@ -185,20 +205,29 @@ class FitRun:
             data = load_yaml(path)
             if not isinstance(data, dict) or "free" not in data or "recordings" not in data:
                 raise InputError(path, "that of a fit", "another run's")
-            modules = data.get("modules")
-            types = _types(None if modules is None else str(folder.path / modules))
-            body = load_morphology(folder.path / data["robot"], types, allow_overlap=True)
-            world = data["world"]
-            inside = folder.path / world
-            water = load_world(inside if inside.is_file() else world, **data["world_fields"])
+            with reading(path):
+                own = read(_FitFile, data)
+                own.settings.pop("draws", None)  # in folders of older versions
+                settings = read(FitSettings, own.settings, "settings")
+            types = _types(None if own.modules is None else str(folder.path / own.modules))
+            body = load_morphology(folder.path / own.robot, types, allow_overlap=True)
+            inside, fields = folder.path / own.world, dict(own.world_fields)
+            grid = fields.get("current_field")
+            if isinstance(grid, str) and (folder.path / grid).is_file():
+                fields["current_field"] = str(folder.path / grid)
+            water = load_world(inside if inside.is_file() else own.world, **fields)
             request = Request(
-                build_robot(body, water), _unpack(folder.path / data["recordings"]),
-                tuple(data["free"]), read(FitSettings, data["settings"], str(path)), data["seed"],
-                (data, {}),
+                build_robot(body, water), _unpack(folder.path / own.recordings), own.free,
+                settings, own.seed, (data, {}),
             )  # fmt: skip
             run = cls(folder, request, _make(request))
-            if folder.checkpoints():
-                run._restore()
+            if newest := folder.checkpoints():
+                try:
+                    run._restore()
+                except (KeyError, TypeError, ValueError) as error:
+                    if isinstance(error, InputError):
+                        raise
+                    raise InputError(newest[0], "a checkpoint of this fit", str(error)) from None
         except BaseException:
             folder.abandon()
             raise

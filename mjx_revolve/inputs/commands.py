@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import logging
 import math
 import os
@@ -82,8 +83,8 @@ def read_path(text: str) -> str:
     return text
 
 
-def positive(unit: str, most: float = math.inf) -> Callable[[str], float]:
-    """A reader of numbers above 0, for `add_argument(type=positive("m"))`."""
+def positive(unit: str, most: float = math.inf, zero: bool = False) -> Callable[[str], float]:
+    """A reader of numbers above 0, or from there on, for `add_argument(type=positive("m"))`."""
 
     def read(text: str) -> float:
         """Reads a number within the bounds."""
@@ -91,8 +92,8 @@ def positive(unit: str, most: float = math.inf) -> Callable[[str], float]:
             value = float(text)
         except ValueError:
             value = math.nan
-        if not 0 < value <= most or value == math.inf:
-            bounds = "> 0" if most == math.inf else f"> 0 and <= {most:g}"
+        if not (0 < value <= most or (zero and value == 0)) or value == math.inf:
+            bounds = f">{'=' * zero} 0" + ("" if most == math.inf else f" and <= {most:g}")
             raise argparse.ArgumentTypeError(f"expected a number {bounds} [{unit}]; found {text!r}")
         return value
 
@@ -166,7 +167,7 @@ def add_colony_arguments(parser: argparse.ArgumentParser) -> None:
     lives = "which lives on for --duration (default: 60 s) from its newest checkpoint"
     parser.add_argument("--colony", action="store_true", help=f"a run's whole colony, {lives}")
     begins = "with --colony: from this time of its life on, in seconds"
-    parser.add_argument("--time", type=read_seconds, metavar="S", help=begins)
+    parser.add_argument("--time", type=positive("s", zero=True), metavar="S", help=begins)
 
 
 def check_colony_arguments(arguments: argparse.Namespace) -> None:
@@ -201,6 +202,16 @@ def check_no_sweep(path: str | Path) -> None:
         raise InputError(path, "one run", f"a sweep of several{such}")
 
 
+def check_no_fit(path: str | Path) -> None:
+    """Raises `InputError` if a path is the folder of a fit, where a run of evolve is expected."""
+    try:
+        info = json.loads((Path(path) / "run.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return
+    if isinstance(info, dict) and info.get("kind") == "fit":
+        raise InputError(path, "a run of evolve", "a fit (its page is report.html)")
+
+
 def check_episode_path(path: str | Path) -> None:
     """Raises `InputError` if there is no run folder, `genes.yaml` or morphology at a path.
 
@@ -208,6 +219,7 @@ def check_episode_path(path: str | Path) -> None:
     """
     shipped = list_shipped("morphologies")
     check_no_sweep(path)
+    check_no_fit(path)
     if not Path(path).exists() and str(path) not in shipped:
         none = f"none, and no shipped morphology of this name ({', '.join(shipped)})"
         raise InputError(path, "a run folder, a genes.yaml or a morphology", none)

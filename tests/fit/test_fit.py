@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -11,7 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from experiments.fit_coverage import commands
 from experiments.fit_measured import GLIDE, fit_glide, fit_lamprey, glide_errors, lamprey_ratios
+from laboratory import check_refused
 from mjx_revolve import fit as command
+from mjx_revolve import report, viewer
 from mjx_revolve.body.coefficients import correct_modules
 from mjx_revolve.body.morphology import load_morphology, make_morphology, save_morphology
 from mjx_revolve.engine.robot import build_robot
@@ -374,12 +377,12 @@ def backwards():
 
 BAD = {
 "words": ("time,x,y\n0,1,2\n1,oops,2\n", "row 3, column x: expected a number; found 'oops'"),
+"blank": ("time,x,y\n\n\n0,1,2\n1,oops,2\n", "row 5, column x: expected a number; found"),
 "back": (changed(time=backwards()), "row 32: expected a time later than 1.45 s; found 1.4 s"),
 "millimetres": (changed(x=200 * np.arange(60.0)), "millimetres or pixels"),
 "other robot": (changed(**{"command.left_hip": np.zeros(60)}), "another robot"),
 "still": (changed(x=np.ones(60), y=np.ones(60), yaw=np.zeros(60)), "a robot that moves"),
 "no place": (changed(x=None, y=None), "expected x and y of the core, marks, or mean_speed"),
-"no x": (changed(x=None), "expected x and y of the core, marks, or mean_speed"),
 "no yaw": (changed(yaw=None, roll=np.zeros(60)), "roll: expected yaw beside it; found none"),
 "half a turn": (changed(qw=np.ones(60)), "qw: expected qx, qy, qz beside it; found none"),
 "semicolons": ("time;x;y\n0;1;2\n1;2;2\n", "commas between them; found semicolons"),
@@ -578,6 +581,27 @@ def test_what_a_fit_goes_on_with_is_its_folder_alone(capsys):
     for more in (["--set", "iterations=9"], ["--plan"], ["--free", "drag"], ["--seed", "3"]):
         assert run_command(command.main, ["--resume", "fit", *more]) == 2
         assert f"as the folder has all else; found {more[0][2:]}" in capsys.readouterr().err
+
+
+def test_a_fit_goes_on_in_the_water_that_it_had(signals, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    ends, velocity = [-9.0, 9.0], np.full((2, 2, 2, 3), 0.1)
+    np.savez("field.npz", x=ends, y=ends, z=ends, velocity=velocity)
+    fields = {"bed": "off", "current_field": "field.npz"}
+    robot, *files = load_robot("auv", None, None, fields, False)
+    recording = make_noisy(signals, seed=2, name="pool")
+    request = Request(robot, (recording,), ("drag",), FitSettings(), 0, tuple(files))
+    FitRun.begin("fit", request).folder.close()
+    Path("field.npz").unlink()
+    again = FitRun.resume("fit")
+    assert (again.problem.robot.world.current_field.velocity == 0.1).all()
+    again.folder.close()
+    path = Path("fit/config.yaml")
+    path.write_text(path.read_text().replace("seed: 0", "seed: x"))
+    check_refused("seed: expected a whole number >= 0; found 'x'", FitRun.resume, "fit")
+    for main in (report.main, viewer.main):
+        assert run_command(main, ["fit"]) == 2
+        assert "expected a run of evolve; found a fit" in capsys.readouterr().err
 
 
 def test_a_fit_that_was_stopped_goes_on_bit_for_bit(signals, tmp_path):

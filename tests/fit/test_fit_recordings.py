@@ -9,12 +9,14 @@ from scipy.spatial.transform import Rotation
 from test_fit import felt, write_csv
 
 from mjx_revolve import fit as command
-from mjx_revolve.body.morphology import load_morphology
+from mjx_revolve.body.morphology import load_morphology, make_morphology
 from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.fitting import TimeSeries, load_recording, make_noisy, run, simulate_signals
 from mjx_revolve.fitting.axes import find_other_axes
 from mjx_revolve.fitting.problem import FitSettings, make_problem
 from mjx_revolve.fitting.recording import read_map
+from mjx_revolve.formats.ros_bag import write_bag as write_ros_bag
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.water.world import load_world
 
@@ -178,6 +180,18 @@ def write_bag(path, series, plugin):
                 topics[topic] = writer.add_connection(topic, kind, typestore=store)
             stamp = round(1e9 * (100 + t))
             writer.write(topics[topic], stamp, store.serialize_cdr(message, kind))
+
+
+def test_joints_of_a_bag_of_ours_are_the_modules(tmp_path):
+    """Evolved modules have names that ROS does not take."""
+    robot = build_robot(make_morphology({"type": "Core", "children": {1: {
+        "id": "Hinge-1-1", "type": "ActiveHinge"}}}), load_world("lake", bed="off"))  # fmt: skip
+    time = 0.05 * np.arange(1, 61)
+    qpos = np.c_[0.1 * time, np.zeros((60, 2)), np.ones(60), np.zeros((60, 3)), np.sin(time)]
+    none = [np.zeros((60, *n)) for n in ((7,), (3, 3), (1,), ())]
+    write_ros_bag(robot, Trajectory(time, qpos, *none), tmp_path / "swim.mcap")
+    found = load_recording(tmp_path / "swim.mcap", robot, {}).signals
+    assert found["angle.Hinge-1-1"].value == pytest.approx(np.sin(time)[1::2], abs=1e-6)
 
 
 def commands_of(auv):

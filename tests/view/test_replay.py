@@ -26,7 +26,7 @@ from mjx_revolve.view.film.video import gif_stride, make_gif, write_mp4
 from mjx_revolve.view.film.waterlight import make_shader
 from mjx_revolve.view.recording import Mark, Recording, ReplayRobot
 from mjx_revolve.view.swim_picture import pose_scenes
-from mjx_revolve.water.flow import Water
+from mjx_revolve.water.flow import Water, water_of
 from mjx_revolve.water.world import load_world
 
 STEP = 0.005
@@ -185,6 +185,16 @@ def test_frames_are_evenly_spaced_and_between_the_rows(episode):
     assert film.robots[0].qpos[15, 0] == pytest.approx(0.2 * film.time[15], abs=1e-9)
     assert film.notes.speed == pytest.approx(math.hypot(0.2, 0.1), rel=0.05)
     assert film.lost is None
+
+
+@pytest.mark.parametrize("every", [1, 4])
+def test_the_water_is_that_of_the_time_whatever_the_rows(episode, every):
+    all_rows = list(vars(episode.trajectory).values())[:6]
+    trajectory = Trajectory(*(x[every - 1 :: every] for x in all_rows))
+    height = 0.1 * np.sin(7 * (trajectory.time - every * STEP))  # at each step's beginning
+    water = water_of(episode.robot.world)._replace(surface_height=height)
+    film = make_film(replace(episode, trajectory=trajectory, water=water), SIZE, 10)
+    assert film.water.surface_height == pytest.approx(0.1 * np.sin(7 * film.time), abs=0.01)
 
 
 def test_a_trajectory_that_fails_is_shown_up_to_there(episode):

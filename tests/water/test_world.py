@@ -131,23 +131,12 @@ def test_a_bed_by_its_height_alone_keeps_it(tmp_path):
 WRONG = [
     ({"density": math.nan}, "density: expected a number >= 0 [kg/m3]; found nan"),
     ({"gravity": (1, 0, -9.8)}, f"{DOWN} (1, 0, -9.8)"),
-    ({"buoyancy": "half"}, "buoyancy: expected one of partial, mask, off; found 'half'"),
     ({"drag": "boxes"}, f"drag: expected {drag_names()}; found 'boxes'"),
-    (
-        {"bed": "sand"},
-        "bed: expected 'off', a height in metres or a mapping with kind; found 'sand'",
-    ),
     (
         {"lift_drag": {"cl": 1}},
         f"lift_drag.cl: expected one of {KEYS} keys; {UNKNOWN} lift_drag.cla?",
     ),
-    ({"bed": {"contact": "MJX"}}, "bed.contact: expected one of penalty, mjx; found 'MJX'"),
     ({"gust": {"std": [1, -2, 0]}}, "gust.std.1: expected a number >= 0 [m/s]; found -2"),
-    ({"waves": {"amplitude": 0.1}}, "waves.0: expected either wavelength or period; found none"),
-    (
-        {"waves": {"amplitude": 0.1, "wavelength": 3, "period": 1}},
-        "waves.0: expected either wavelength or period; found both",
-    ),
     # Miche: 2 a / L at most 0.142, a = 0.071 m at 1 m.
     (
         {"waves": {"amplitude": 0.0711, "wavelength": 1}},
@@ -171,8 +160,6 @@ def test_wrong_overrides(override, message):
     ("text", "message"),
     [
         ("", "expected a mapping of world fields; found None"),
-        ("1: 2", "1: expected the name of a setting; found a key that is no text"),
-        ("name: 3", "name: expected a text; found 3"),
     ],
 )
 def test_wrong_files(tmp_path, text, message):
@@ -187,8 +174,6 @@ def test_unknown_worlds(tmp_path):
     )
     with pytest.raises(InputError, match=r"none\.yaml: expected a file; found none$"):
         load_world(tmp_path / "none.yaml")
-    with pytest.raises(InputError, match=r"^world: expected a name or a path; found 5$"):
-        load_world(5)
 
 
 X, Y, Z = np.array([0.0, 1.0, 3.0]), np.array([-1.0, 2.0]), np.array([-4.0, -1.0])
@@ -267,10 +252,7 @@ GRID = "expected one row for each of 3 x 2 x 2 points of a full grid"
     ("lines", "message"),
     [
         (["x,y,z,u,v"], "line 1: expected columns x, y, z, u, v, w; found no w"),
-        (["x,y,z,u,v,w,x"], "line 1: expected columns x, y, z, u, v, w; found x twice"),
-        (["x,y,z,u,v,w", "", "1,2,3,4,5"], "line 3: expected 6 numbers; found 5"),
         (["x,y,z,u,v,w", "1,2,3,4,5,fast"], "line 2: expected a number; found 'fast'"),
-        (["x,y,z,u,v,w", "1,2,3,4,5,nan"], "line 2: expected a finite number; found 'nan'"),
         (["x,y,z,u,v,w", *table()[1:]], f"{GRID}; found 11 rows"),
         (["x,y,z,u,v,w", *table(), table()[5]], f"{GRID}; found (1, -1, -1) twice"),
     ],
@@ -286,18 +268,10 @@ def test_wrong_tables(tmp_path, lines, message):
     ("changes", "message"),
     [
         ({"x": None}, "expected arrays x, y, z, velocity; found no x"),
-        ({"y": np.zeros((2, 1))}, "y: expected a row of numbers [m]; found shape [2, 1]"),
         ({"z": [-1.0, -4.0]}, "z: expected rising numbers [m]; found -4 after -1"),
-        ({"x": [0.0, np.nan, 1.0]}, "x: expected finite numbers; found NaN or infinity"),
-        ({"velocity": VELOCITY + 0j}, "velocity: expected real numbers; found complex128"),
         (
             {"velocity": VELOCITY[..., :2]},
             "velocity: expected shape [3, 2, 2, 3], as x, y and z have it; found [3, 2, 2, 2]",
-        ),
-        (
-            {"x": np.array([None, 1, 2])},
-            "expected arrays of numbers; found: Object arrays cannot be loaded when "
-            "allow_pickle=False",
         ),
     ],
 )
