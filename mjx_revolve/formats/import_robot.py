@@ -30,8 +30,8 @@ _SPECK = 1e-4
 _DRY = {"volume": 0.0, "contact": False, "drag": "off", "added_mass": False}
 # Four corners of a cube, no two on one edge: as many points as the inertia of a body needs.
 _CORNERS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], float)
-# Range of a continuous joint [rad], as our hinges have a range.
-_WHOLE = np.pi
+# Ranges of a continuous joint and of one that cannot turn [rad], as our hinges have a range.
+_WHOLE, _STILL = np.pi, 1e-3
 
 
 @dataclass(frozen=True)
@@ -229,9 +229,12 @@ def _hinge(link: RigidLink, turn: np.ndarray, missing: list[str]) -> dict[str, A
         missing.append(f"{link.name}: turns all the way; here from -π to π")
     if low > high:
         raise InputError(link.name, "a range [lowest, highest]", f"[{low:g}, {high:g}]")
-    if not low <= 0 <= high or low == high:
+    if low == high == 0:
+        high = _STILL
+        missing.append(f"{link.name}: cannot turn; here from 0 to {high:g} rad")
+    if not low <= 0 <= high:
         missing.append(f"{link.name}: its range [{low:g}, {high:g}] lacks the rest pose, 0")
-        low, high = min(low, 0.0), max(high, 0.0) + (low == high == 0) * 1e-3
+        low, high = min(low, 0.0), max(high, 0.0)
     given = [name for name in ("effort", "speed") if name in link.limits]
     lacking = [name for name in ("effort", "speed") if name not in given]
     if lacking:
