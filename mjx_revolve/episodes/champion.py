@@ -56,9 +56,9 @@ class Episode:
         water: surface and current at each row; None: the world's.
         genes: `[G]` or None without a controller.
         fitness: of the run, or None.
-        task: of the run, or None.
         folder: the run folder, or None.
         starts: those over which the score is the mean, in words.
+        task: of the run, or None; of `fitness` where there is one.
     """
 
     title: str
@@ -69,9 +69,14 @@ class Episode:
     water: Water | None = None
     genes: np.ndarray | None = None
     fitness: Fitness | None = None
-    task: TaskConfig | None = None
     folder: Path | None = None
     starts: str = "fresh starts"
+    task: TaskConfig | None = None
+
+    def __post_init__(self) -> None:
+        """Takes the task of the fitness."""
+        if self.task is None and self.fitness is not None:
+            object.__setattr__(self, "task", self.fitness.config.task)
 
     __repr__ = short_repr
 

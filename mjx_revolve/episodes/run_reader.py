@@ -58,7 +58,8 @@ def check_runs(names: Sequence[str | Path]) -> None:
         if not check_path(name).is_dir():
             found = "a file" if Path(name).exists() else "none"
             raise InputError(name, "a run folder", found)
-        check_no_fit(name)
+    if len(names) == 1:  # among others, a report leaves it out
+        check_no_fit(names[0])
     files = ("config.yaml", "run.json", "metrics.csv", "champion", SWEEP)
     folders = [f for f in map(Path, names) for f in (f, f.parent)]
     if not any((folder / file).exists() for folder in folders for file in files):

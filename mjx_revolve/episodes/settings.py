@@ -208,8 +208,8 @@ def find_copies(folder: Path) -> dict[str, Path]:
         InputError: a copy is no longer what the run began with.
     """
     try:
-        listed = json.loads((folder / "run.json").read_bytes()).get("inputs", {})
-    except (OSError, ValueError, RecursionError, AttributeError):
+        listed = json.loads(read_file(folder / "run.json")).get("inputs", {})
+    except (InputError, OSError, ValueError, RecursionError, AttributeError):
         return {}  # reported by the reader of the other fields
     found = {}
     for name, digest in listed.items() if isinstance(listed, dict) else ():

@@ -27,6 +27,8 @@ FEW = 30
 """With fewer measurements of a kind, their noise is what is usual: a wrong model would else pass
 for noise; intervals are widened by what is left (Birge 1932). A choice."""
 _LEAST_NOISE = 0.02  # of `NOISE`: no recording is better, and what was simulated has none at all
+# In shorter windows correlation of neighbours may be chance. A choice [frames].
+_FEWEST_ROWS = 12.0
 # With short windows the search need not arrive, and makes so many steps at most. Choices.
 _SHORT_STEPS, _SHORT_TOLERANCE = 20, 0.1
 # A window is cut in two where, two standard deviations of some number away, its motion differs from
@@ -245,7 +247,8 @@ def estimate_noise(problem: FitProblem, values: list[np.ndarray], used: float) -
             sigma = float(np.sqrt(np.mean(x**2)))
             for _ in range(8):
                 sigma = float(np.sqrt(np.mean(np.minimum(x**2, (_HUBER * sigma) ** 2))))
-        found[kind] = max(sigma / np.sqrt(share), _LEAST_NOISE * NOISE[kind])
+            sigma /= float(np.sqrt(share))
+        found[kind] = max(sigma, _LEAST_NOISE * NOISE[kind])
     return found
 
 
@@ -283,13 +286,15 @@ def correlation(problem: FitProblem, values: list[np.ndarray]) -> dict[str, floa
             x = left[channel.fitted & (where == k)]
             a, b = x[:-1].ravel(), x[1:].ravel()
             known = np.isfinite(a) & np.isfinite(b)
+            if not known.any():  # a mean speed has no neighbour
+                continue
             square_sum = float(x[np.isfinite(x)] @ x[np.isfinite(x)])
             both = float(a[known] @ b[known]), square_sum, square_sum * len(x)
             lagged.setdefault(channel.kind, []).append(both)
     found = {channel.kind: 1.0 for channel in problem.channels}
     for kind, many in lagged.items():
         product, square_sum, weighted = (sum(x[k] for x in many) for k in range(3))
-        rows = max(weighted / max(square_sum, 1e-30), 4.0)
+        rows = max(weighted / max(square_sum, 1e-30), _FEWEST_ROWS)
         # What is fitted takes some of it away (Marriott and Pope 1954).
         rho = (product / max(square_sum, 1e-30) + 1 / rows) / (1 - 3 / rows)
         rho = min(max(rho, 0.0), 0.95)

@@ -37,10 +37,11 @@ from mjx_revolve.fitting.poses import (
     rest_height,
     smooth,
 )
-from mjx_revolve.fitting.recording import RobotRecording
+from mjx_revolve.fitting.recording import RobotRecording, TimeSeries
 from mjx_revolve.fitting.simulation import ROOT, Drive, simulate_windows
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.schema import Integer, Number, checked
+from mjx_revolve.numerics.spatial import continuous_quaternions
 
 # Records lie no further apart [s]: interpolation is then good to a millimetre and a tenth of a
 # degree.
@@ -532,11 +533,36 @@ def _held(
     return mean
 
 
+def _from_first_frame(recording: RobotRecording) -> RobotRecording:
+    """Without what sensors say before the first frame, when nothing says where the robot is."""
+    signals = recording.signals
+    frames = [s.time[0] for n, s in signals.items() if n == "x" or n.startswith("mark.")]
+    found = {}
+    for name, (time, value) in signals.items():
+        sent = name.startswith(("command.", "angle."))
+        kept = time >= (time[0] if sent or not frames else min(frames))
+        if kept.any():
+            found[name] = TimeSeries(time[kept], value[kept])
+    return replace(recording, signals=found)
+
+
+def _interpolate_pose(time: np.ndarray, pose: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """`[T, 7]` poses of `[n, 7]`, of which the quaternion alone is known, NaN in its gaps."""
+    found = np.full((len(at), 7), np.nan)
+    known = np.isfinite(pose[:, 3:]).all(1)
+    if known.any():
+        turn = continuous_quaternions(pose[known, 3:])
+        found[:, 3:] = np.stack([np.interp(at, time[known], x) for x in turn.T], -1)
+        found[gap(time[known], at), 3:] = np.nan
+    return found
+
+
 class _View:
     """A recording as poses of a robot's core."""
 
     def __init__(self, robot: Robot, recording: RobotRecording, hinges: Sequence[str]) -> None:
         """Finds the core's poses."""
+        recording = _from_first_frame(recording)
         self.robot, self.recording, self.hinges = robot, recording, hinges
         signals = recording.signals
         self.names = list(recording.marks)
@@ -545,6 +571,8 @@ class _View:
         self.mark_time, seen = recording.table(wanted)
         self.seen = seen.reshape(len(self.mark_time), len(self.names), 3)
         self.time, pose = recording.table(["x", "y", "z", "qw", "qx", "qy", "qz"])
+        if self.names and "x" not in signals:  # an attitude beside marks is taken at their times
+            self.time, pose = self.mark_time, _interpolate_pose(self.time, pose, self.mark_time)
         self.position, quat = pose[:, :3], pose[:, 3:]
         self.planar = "z" not in signals
         self.quat: np.ndarray | None = quat if "qw" in signals else None
@@ -559,6 +587,7 @@ class _View:
             self.quat = Rotation.from_euler("ZYX", np.stack(turns, -1)).as_quat(scalar_first=True)
             self.quat[gap(signals["yaw"].time, self.time)] = np.nan
             self.level = "roll" not in signals
+        self.has_attitude = self.quat is not None
         if self.names:
             self._fit_marks()
         if self.quat is not None and not np.isfinite(self.quat).all(1).any():
@@ -591,11 +620,11 @@ class _View:
         length = float(body_geometry(self.robot).length)
         seen = joined_marks(self.mark_time, self.seen, dims)
         check_marks(model, seen, self.planar, self.names, self.mark_time, length)
-        self.time = self.mark_time
         if len(self.names) >= dims:
-            self.position, self.quat, _ = fit_rigid(model, seen, self.planar)
-            self.quat[np.isnan(self.position[:, 0])] = np.nan
-            self.level = self.planar
+            self.position, quat, _ = fit_rigid(model, seen, self.planar)
+            if not self.has_attitude:
+                self.quat, self.level = quat, self.planar
+                self.quat[np.isnan(self.position[:, 0])] = np.nan
         else:
             self.position = self.seen[:, 0]
         if self.planar:
@@ -638,11 +667,9 @@ class _View:
             found[:, 2], found[:, 9] = self.robot.world.surface_height - value[:, 0], -rate[:, 0]
             spread[:, [2, 8]] = _SEEN[[2, 8]]
         if self.quat is not None:
-            quat, known = self.quat.copy(), np.isfinite(self.quat).all(1)
-            # Of one sign from frame to frame.
-            q = quat[known] / np.linalg.norm(quat[known], axis=1, keepdims=True)
-            turn = np.append(1.0, np.where(np.sum(q[1:] * q[:-1], 1) < 0, -1.0, 1.0))
-            value, rate, _ = smooth(self.time[known], q * np.cumprod(turn)[:, None], at)
+            known = np.isfinite(self.quat).all(1)
+            q = self.quat[known] / np.linalg.norm(self.quat[known], axis=1, keepdims=True)
+            value, rate, _ = smooth(self.time[known], continuous_quaternions(q), at)
             value /= np.linalg.norm(value, axis=1, keepdims=True)
             found[:, 3:7] = value
             w, v, dw, dv = value[:, :1], value[:, 1:], rate[:, :1], rate[:, 1:]
@@ -666,9 +693,6 @@ class _View:
         if "x" in signals:
             position = self.position
             add("position", self.time, lambda s: s[..., :3] - position, position)
-            if self.quat is not None:
-                level, quat = self.level, self.quat
-                add("attitude", self.time, lambda s: _turn_error(s[..., 3:7], quat, level))
         elif self.names:
             hinges = len(self.hinges)
             seen, points = self.seen, self.points
@@ -680,8 +704,12 @@ class _View:
                 return left.reshape(*s.shape[:2], -1)
 
             add("marks", self.mark_time, off, seen.reshape(len(seen), -1))
+        if self.quat is not None and self.has_attitude:
+            level, quat = self.level, self.quat
+            add("attitude", self.time, lambda s: _turn_error(s[..., 3:7], quat, level))
         if servos_free:
             time, values = self.recording.table([f"angle.{h}" for h in self.hinges])
+            time, values = time[time >= self.begin], values[time >= self.begin]
             if len(time):
                 add("angles", time, lambda s: s[..., ROOT : ROOT + len(self.hinges)] - values)
         if (depth := signals.get("depth")) is not None:

@@ -351,10 +351,11 @@ def _read_bag(
     from rosbags.typesys import Stores, get_typestore
 
     # What we export has names that ROS takes.
-    modules = {plain(name): name for name in robot.morphology.thruster_names}
-    for link in make_links(robot):
-        if link.joint is not None:
-            modules[link.joint.name] = robot.mj_model.body(link.body).name
+    links, jets = make_links(robot), robot.morphology.thruster_names
+    modules = {
+        "JointState": {x.joint.name: robot.mj_model.body(x.body).name for x in links if x.joint},
+        "Float64MultiArray": {plain(name): name for name in jets} | {name: name for name in jets},
+    }
     store: Any = get_typestore(Stores.ROS2_HUMBLE)
     kept: dict[str, list[tuple[float, float]]] = {}
     chosen: dict[str, str] = {}
@@ -374,9 +375,9 @@ def _read_bag(
                     continue
                 message = store.deserialize_cdr(raw, connection.msgtype)
                 for name, value in use(message, topic):
-                    head, dot, joint = name.partition(".")
-                    if head in ("command", "angle"):
-                        name = head + dot + modules.get(joint, joint)
+                    if names := modules.get(kind):
+                        head, _, module = name.partition(".")
+                        name = f"{head}.{names.get(module, module)}"
                     kept.setdefault(name, []).append((1e-9 * stamp, float(value)))
     except InputError:
         raise
@@ -509,7 +510,9 @@ def _check_signals(signals: Mapping[str, TimeSeries], robot: Robot) -> list[str]
         if (low := float(np.mean(speed.value))) < 0:
             raise InputError("mean_speed", "at least 0 m/s", f"{low:g}")
     quat = [f"q{axis}" for axis in "wxyz"]
-    for given, needed in ((("roll", "pitch"), ["qw" if "qw" in signals else "yaw"]), (quat, quat)):
+    whole, tilt = ["qw" if "qw" in signals else "yaw"], ["roll", "pitch"]
+    both = [] if "qw" in signals else tilt  # one alone says nothing of the other
+    for given, needed in ((tilt, whole), (tilt, both), (quat, quat)):
         there = [n for n in given if n in signals]
         if there and (missing := [n for n in needed if n not in signals]):
             raise InputError(

@@ -74,10 +74,11 @@ class Prediction:
     @property
     def way(self) -> float:
         """Length of the recorded way, in steps of a tenth of it [m]."""
-        known = np.flatnonzero(np.isfinite(self.recorded).any(1))
-        rows = known[np.linspace(0, len(known) - 1, 11).astype(int)] if len(known) else known
-        steps = np.diff(self.recorded[rows], axis=0)
-        return float(np.sqrt(np.nansum(steps**2, 1)).sum())
+        at, axes = np.linspace(self.time[0], self.time[-1], 11), []
+        for x in self.recorded.T:
+            if (known := np.isfinite(x)).any():
+                axes.append(np.interp(at, self.time[known], x[known]))
+        return float(np.sqrt(np.square(np.diff(axes, axis=-1)).sum(0)).sum()) if axes else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +161,7 @@ def _plain(value: object) -> Any:
         return {key: _plain(x) for key, x in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(x) for x in value]
-    return round(float(value), 9) if isinstance(value, float) else value
+    return float(f"{value:.10g}") if isinstance(value, float) else value
 
 
 def fit_robot(

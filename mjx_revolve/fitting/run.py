@@ -221,13 +221,8 @@ class FitRun:
                 settings, own.seed, (data, {}),
             )  # fmt: skip
             run = cls(folder, request, _make(request))
-            if newest := folder.checkpoints():
-                try:
-                    run._restore()
-                except (KeyError, TypeError, ValueError) as error:
-                    if isinstance(error, InputError):
-                        raise
-                    raise InputError(newest[0], "a checkpoint of this fit", str(error)) from None
+            if folder.checkpoints():
+                run._restore()
         except BaseException:
             folder.abandon()
             raise
@@ -236,9 +231,17 @@ class FitRun:
     def _restore(self) -> None:
         checkpoint = self.folder.load_checkpoint()
         arrays, meta = checkpoint.arrays, checkpoint.meta
+        roots, resets = self.problem.roots, self.problem.drive.resets
+        own = {**vars(self.problem.origin()), "roots": roots, "damping": resets}
+        for name, like in own.items():
+            shape = np.shape(arrays[name]) if name in arrays else None
+            if shape != np.shape(like):
+                found = f"{name} of shape {shape}"
+                raise InputError(checkpoint.path, "a checkpoint of this fit", found)
+        if missing := [name for name in _PLAIN if name not in meta]:
+            raise InputError(checkpoint.path, "a checkpoint of a fit", f"no {missing[0]}")
         self.folder.rewind(checkpoint)
-        self.problem.roots[:] = arrays["roots"]
-        resets = self.problem.drive.resets
+        roots[:] = arrays["roots"]
         resets[:] = arrays.get("resets", resets)  # folders of older versions have no cut windows
         point = Point(arrays["free"], arrays["local"], arrays["starts"])
         self.state = FitState(

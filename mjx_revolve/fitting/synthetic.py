@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.fitting.problem import FitSettings, make_problem
 from mjx_revolve.fitting.recording import RobotRecording, TimeSeries
+from mjx_revolve.inputs.errors import InputError
 
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
@@ -19,7 +20,7 @@ def simulate_signals(
     free: Sequence[str] = ("drag",),
     offsets: Sequence[float] | np.ndarray = (0.0,),
     ctrl: np.ndarray | None = None,
-    current: Sequence[float] = (0.0, 0.0, 0.0),
+    current: Sequence[float] = (0.0, 0.0),
     velocity: Sequence[float] = (0.0,) * 6,
     duration: float = 5.0,
 ) -> dict[str, TimeSeries]:
@@ -30,13 +31,15 @@ def simulate_signals(
         free: names of those that are others.
         offsets: of them from their priors' medians (logarithms of factors).
         ctrl: `[T, nu]` commands, MuJoCo's order, a row for each step; none for `duration`.
-        current: of the water [m/s].
+        current: of the water, horizontal [m/s].
         velocity: of the core at first: world frame [m/s], turning in its own [rad/s].
         duration: without commands [s].
 
     Returns:
         Pose and commands by signal.
     """
+    if any(current[2:]):
+        raise InputError("current", "a horizontal one", list(current))
     dt = robot.world.timestep
     count = round(duration / dt) if ctrl is None else len(ctrl)
     time = dt * np.arange(count + 1)

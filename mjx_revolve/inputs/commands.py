@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 
 from mjx_revolve.inputs import early_sigint
 from mjx_revolve.inputs.errors import InputError, plain
-from mjx_revolve.inputs.files import SWEEP, check_path
+from mjx_revolve.inputs.files import SWEEP, check_path, read_file
 from mjx_revolve.inputs.packages import check_mujoco
 from mjx_revolve.inputs.shipped import list_shipped
 from mjx_revolve.inputs.trust import add_trust_argument, opening
@@ -205,11 +205,12 @@ def check_no_sweep(path: str | Path) -> None:
 def check_no_fit(path: str | Path) -> None:
     """Raises `InputError` if a path is the folder of a fit, where a run of evolve is expected."""
     try:
-        info = json.loads((Path(path) / "run.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        info = json.loads(read_file(Path(path) / "run.json"))
+    except (InputError, OSError, ValueError, RecursionError):
         return
     if isinstance(info, dict) and info.get("kind") == "fit":
-        raise InputError(path, "a run of evolve", "a fit (its page is report.html)")
+        found = "a fit, which has a report.html, and which fit --resume continues"
+        raise InputError(path, "a run of evolve", found)
 
 
 def check_episode_path(path: str | Path) -> None:

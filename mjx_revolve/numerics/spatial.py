@@ -300,3 +300,10 @@ def matrix_to_quat(matrix: np.ndarray) -> np.ndarray:
     row = np.where(x + y + z > 0, 0, largest)
     quat = np.take_along_axis(products, row[..., None, None], -2)[..., 0, :]
     return quat / np.linalg.norm(quat, axis=-1, keepdims=True)
+
+
+def continuous_quaternions(quaternion: np.ndarray) -> np.ndarray:
+    """Quaternions `[S, ..., 4]` of which neighbours in time are close: q and -q turn alike."""
+    flips = np.where((quaternion[1:] * quaternion[:-1]).sum(-1) < 0, -1.0, 1.0)
+    signs = np.concatenate([np.ones_like(quaternion[:1, ..., 0]), np.cumprod(flips, axis=0)])
+    return quaternion * signs[..., None]

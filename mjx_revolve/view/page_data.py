@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.numerics.spatial import matrix_to_quat
+from mjx_revolve.numerics.spatial import continuous_quaternions, matrix_to_quat
 from mjx_revolve.view.pieces import make_pieces, mount_piece, smooth_mesh
-from mjx_revolve.view.poses import continuous_quaternions
 from mjx_revolve.view.surroundings import bed_rings
 from mjx_revolve.water.world import World
 

@@ -12,7 +12,7 @@ from mjx_revolve.engine.kinematics import body_poses
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.champion import Episode
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.numerics.spatial import matrix_to_quat
+from mjx_revolve.numerics.spatial import continuous_quaternions, matrix_to_quat
 from mjx_revolve.view.motion import count_finite
 
 
@@ -37,13 +37,6 @@ def pose_robot(robot: Robot, qpos: np.ndarray) -> Poses:
     parts = np.einsum("spij,pj->spi", rotation[:, table.body], table.position)
     quaternion = continuous_quaternions(matrix_to_quat(rotation))
     return Poses(position, quaternion, position[:, table.body] + parts)
-
-
-def continuous_quaternions(quaternion: np.ndarray) -> np.ndarray:
-    """Quaternions `[S, ..., 4]` of which neighbours in time are close: q and -q turn alike."""
-    flips = np.where((quaternion[1:] * quaternion[:-1]).sum(-1) < 0, -1.0, 1.0)
-    signs = np.concatenate([np.ones_like(quaternion[:1, ..., 0]), np.cumprod(flips, axis=0)])
-    return quaternion * signs[..., None]
 
 
 def finite_rows(episode: Episode) -> tuple[Episode, float | None]:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.poses import continuous_quaternions
+from mjx_revolve.numerics.spatial import continuous_quaternions
 
 
 @dataclass(frozen=True, eq=False)

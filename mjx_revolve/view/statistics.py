@@ -31,8 +31,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-LEVEL = 0.95  # of intervals
-ALPHA = 1 - LEVEL  # a smaller p is called a difference
+ALPHA = 0.05  # a smaller p is called a difference
+LEVEL = 1 - ALPHA  # of intervals
 FEWEST = 3  # values for which an interval is drawn: t(0.975, 1) = 12.7 is wider than any page
 _RESAMPLES = 9999  # of permutation tests, where there are more permutations
 COVERAGE = (

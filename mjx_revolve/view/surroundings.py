@@ -37,7 +37,7 @@ def water_at(
         Water of `[S]` each.
     """
     # A row of the trajectory is the state after its step, which the next step's water meets.
-    after = np.minimum(rows + 1, steps - 1)
+    after = np.clip(rows + 1, 0, steps - 1)
     pick = lambda x: np.broadcast_to(np.asarray(x, np.float32), (steps,))[after]  # noqa: E731
     now: Water = jax.tree.map(pick, water_of(world) if water is None else water)
     return now._replace(time=(now.time + time).astype(np.float32))

@@ -177,18 +177,19 @@ def _fit(
 
     times = [np.asarray(one.time, float) for one in robots]
     qpos = [np.asarray(one.qpos, float) for one in robots]
-    gap, total, before = _CLOSEST, sum(map(len, times)), -1
-    usual = max((float(np.median(np.diff(t))) for t in times if len(t) > 1), default=0.0)
-    for _ in range(_TRIES):
+    gap, total, size = _CLOSEST, sum(map(len, times)), 0
+    usual = min((float(np.median(np.diff(t))) for t in times if len(t) > 1), default=0.0)
+    longest = max(float(t[-1] - t[0]) for t in times)
+    for attempt in range(_TRIES):
+        if attempt:
+            gap = max(gap, usual) * max(1.1, size / room)
         rows = [_thin(time, gap, window) for time in times]
         kept_times = [x[own] for x, own in zip(times, rows, strict=True)]
         kept_qpos = [x[own] for x, own in zip(qpos, rows, strict=True)]
         packed = pack_poses(kept_times, kept_qpos, _STEPS)
         count, size = sum(map(len, rows)), len(packed["poses"])
-        if size <= room or count == before:  # what is left is in the window
+        if size <= room or gap > longest:  # what is left is in the window
             break
-        before = count
-        gap = max(gap, usual) * max(1.1, size / room)
     return count, gap if count < total else 0.0, packed
 
 

@@ -36,7 +36,7 @@ from mjx_revolve.fitting.estimate import correlation, costs_of, linearize, middl
 from mjx_revolve.fitting.identify import find_unknown, plan_motions
 from mjx_revolve.fitting.parameters import entries_of, read_free, with_values
 from mjx_revolve.fitting.problem import NOISE, make_problem
-from mjx_revolve.fitting.recording import read_map
+from mjx_revolve.fitting.recording import MarkedPoint, read_map
 from mjx_revolve.fitting.run import FitRun, Request, load_robot
 from mjx_revolve.fitting.synthetic import simulate_signals
 from mjx_revolve.inputs.commands import run_command
@@ -190,10 +190,11 @@ def test_few_recordings_of_a_mean_speed_count_in_whole(auv):
     """Of each there is one number, at its end: a share of it cannot be held out."""
     time = np.arange(60) / 20
     commands = {f"command.{n}": TimeSeries(time, 0 * time + 0.4) for n in ("port", "starboard")}
-    speed = TimeSeries(time[-1:], np.array([0.2]))
+    speed = TimeSeries(time[[0, -1]], np.array([0.2, 0.2]))
     given = [RobotRecording(name, commands | {"mean_speed": speed}) for name in "ab"]
     found = make_problem(auv, given, ["drag"], FitSettings())
     assert [c.fitted.tolist() for c in found.channels] == [[True, True]] * 2
+    assert correlation(found, linearize(found, found.origin()).values) == {"speed": 1.0}
 
 
 def test_a_sensor_of_what_is_held_out_alone_inflates_nothing(auv, signals):
@@ -205,6 +206,21 @@ def test_a_sensor_of_what_is_held_out_alone_inflates_nothing(auv, signals):
     problem = make_problem(auv, given, ["drag"], FitSettings())
     left = linearize(problem, problem.origin()).values
     assert correlation(problem, left)["depth"] == 1.0
+
+
+def test_an_attitude_beside_one_mark_counts(auv):
+    time = np.arange(80) / 20
+    spots = {f"mark.light.{x}": TimeSeries(time, v * time) for x, v in (("x", 0.1), ("y", 0.0))}
+    late, late_time = np.cos(0.15 + 0 * time), time + 0.01
+    turns = {"qw": late, "qx": 0 * late, "qy": 0 * late, "qz": np.sqrt(1 - late**2)}
+    for own in ({"yaw": TimeSeries(time - 1, 0.3 + 0 * time)},
+                {n: TimeSeries(late_time, x) for n, x in turns.items()}):  # fmt: skip
+        light = {"light": MarkedPoint(0, (0.0, 0.1, 0.0))}
+        given = RobotRecording("tracked", spots | own, light)
+        problem = make_problem(auv, [given], ["drag"], FitSettings())
+        assert [c.kind for c in problem.channels] == ["marks", "attitude"]
+        yaw = Rotation.from_quat(problem.roots[:, 3:7, 0], scalar_first=True).as_rotvec()[:, 2]
+        assert yaw == pytest.approx(0.3, abs=1e-6)
 
 
 def test_what_is_held_out_is_foretold_better_than_before(fitted):
@@ -384,6 +400,7 @@ BAD = {
 "still": (changed(x=np.ones(60), y=np.ones(60), yaw=np.zeros(60)), "a robot that moves"),
 "no place": (changed(x=None, y=None), "expected x and y of the core, marks, or mean_speed"),
 "no yaw": (changed(yaw=None, roll=np.zeros(60)), "roll: expected yaw beside it; found none"),
+"half a tilt": (changed(roll=np.zeros(60)), "roll: expected pitch beside it; found none"),
 "half a turn": (changed(qw=np.ones(60)), "qw: expected qx, qy, qz beside it; found none"),
 "semicolons": ("time;x;y\n0;1;2\n1;2;2\n", "commas between them; found semicolons"),
 "degrees": (changed(yaw=25 * np.arange(60.0)), "yaw: expected radians; found steps of 500 a"),

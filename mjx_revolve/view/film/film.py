@@ -135,13 +135,13 @@ def make_film(episode: Episode, size: tuple[int, int] = (640, 480), fps: int = 3
     robot, world = episode.robot, episode.robot.world
     episode, lost = finite_rows(episode)
     rows = np.asarray(episode.trajectory.time, float)
-    # Rows are equally spaced, and the start is one such interval before the first.
     time = np.arange(max(1, round(float(rows[-1]) * fps))) / fps
     qpos = interpolate_poses(rows, np.asarray(episode.trajectory.qpos), time)
     parts = pose_robot(robot, qpos).parts
     center, radius = enclosing_balls(parts, np.linalg.norm(robot.fluid.half_size, axis=1))
     period = stroke_period(time, qpos[:, 7:])
-    before = np.round(time / rows[0]).astype(int) - 1
+    step = float(np.diff(rows).mean()) if len(rows) > 1 else world.timestep
+    before = np.round((time - rows[0]) / step).astype(int)
     water = water_at(world, before, time, len(rows), episode.water)
     shots = plan_shots(
         time,

@@ -19,6 +19,7 @@ from mjx_revolve.episodes.individual_log import EVENTS, GENERATIONS, INDIVIDUALS
 from mjx_revolve.episodes.passport import PASSPORT, load_passport
 from mjx_revolve.episodes.run_reader import RunReader, find_run, generation_of, read_metrics
 from mjx_revolve.episodes.settings import find_copies, locate_files
+from mjx_revolve.inputs.commands import check_no_fit
 from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.files import check_path, resolve_inside
 from mjx_revolve.inputs.packages import installed_version
@@ -49,6 +50,7 @@ def read_run(folder: str | Path) -> RunRecord:
     path = check_path(folder)
     if not path.is_dir():
         raise InputError(path, "a run folder", "a file" if path.exists() else "none")
+    check_no_fit(path)
     with suppress(InputError):  # without a config.yaml, the rest is read
         path = find_run(path)
     label = str(path) if str(path) not in (".", "..") else path.resolve().name
