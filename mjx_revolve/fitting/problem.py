@@ -56,6 +56,8 @@ _STEP, _FREE_STEP, _FREE_SHARE, _FINEST = 1e-3, 0.02, 0.2, 1e-4
 # The search begins with windows that are so many times shorter: a robot that tumbles for seconds
 # leads a search that begins far from its numbers astray. A choice.
 _PARTS = 4
+# An attitude that is farther from what marks say is one of another frame [rad]. A choice.
+_OTHER_HEADING = 0.5
 # In place of states of a simulation that diverged.
 _DIVERGED = 1e6
 START = 12
@@ -533,14 +535,22 @@ def _held(
     return mean
 
 
+_SENT = ("command.", "angle.")
+# What is interpolated, from rows before the first frame on, too.
+_TURNS = ("yaw", "pitch", "roll")
+
+
 def _from_first_frame(recording: RobotRecording) -> RobotRecording:
     """Without what sensors say before the first frame, when nothing says where the robot is."""
     signals = recording.signals
-    frames = [s.time[0] for n, s in signals.items() if n == "x" or n.startswith("mark.")]
-    found = {}
+    frames = [signals["x"].time[0]] if "x" in signals else [
+        s.time[0] for n, s in signals.items() if n.startswith("mark.")
+    ]  # fmt: skip
+    if not frames or "mean_speed" in signals:
+        return recording
+    found, earlier = {}, (*_SENT, *_TURNS, *(() if "x" in signals else ("qw", "qx", "qy", "qz")))
     for name, (time, value) in signals.items():
-        sent = name.startswith(("command.", "angle."))
-        kept = time >= (time[0] if sent or not frames else min(frames))
+        kept = time >= (time[0] if name.startswith(earlier) else min(frames))
         if kept.any():
             found[name] = TimeSeries(time[kept], value[kept])
     return replace(recording, signals=found)
@@ -550,7 +560,7 @@ def _interpolate_pose(time: np.ndarray, pose: np.ndarray, at: np.ndarray) -> np.
     """`[T, 7]` poses of `[n, 7]`, of which the quaternion alone is known, NaN in its gaps."""
     found = np.full((len(at), 7), np.nan)
     known = np.isfinite(pose[:, 3:]).all(1)
-    if known.any():
+    if known.sum() > 1:
         turn = continuous_quaternions(pose[known, 3:])
         found[:, 3:] = np.stack([np.interp(at, time[known], x) for x in turn.T], -1)
         found[gap(time[known], at), 3:] = np.nan
@@ -587,16 +597,16 @@ class _View:
             self.quat = Rotation.from_euler("ZYX", np.stack(turns, -1)).as_quat(scalar_first=True)
             self.quat[gap(signals["yaw"].time, self.time)] = np.nan
             self.level = "roll" not in signals
-        self.has_attitude = self.quat is not None
+        self.attitude = None if self.quat is None else (self.quat, self.level)
         if self.names:
             self._fit_marks()
         if self.quat is not None and not np.isfinite(self.quat).all(1).any():
             self.quat = None
-        times = [signals[n].time for n in signals if not n.startswith(("command.", "angle."))]
-        if "mean_speed" in signals:
-            times += [s.time for n, s in signals.items() if n.startswith(("command.", "angle."))]
-        self.begin = min(float(t[0]) for t in times)
-        self.end = max(float(t[-1]) for t in times)
+        spans = {n: s.time for n, s in signals.items()
+                 if "mean_speed" in signals or not n.startswith(_SENT)}  # fmt: skip
+        late = () if "mean_speed" in signals else (*_TURNS, "qw", "qx", "qy", "qz")
+        self.begin = min(float(t[0]) for n, t in spans.items() if n not in late)
+        self.end = max(float(t[-1]) for t in spans.values())
 
     def check_frames(self, window: float) -> None:
         """Refuses a recording of which a window has no two frames."""
@@ -621,14 +631,28 @@ class _View:
         seen = joined_marks(self.mark_time, self.seen, dims)
         check_marks(model, seen, self.planar, self.names, self.mark_time, length)
         if len(self.names) >= dims:
-            self.position, quat, _ = fit_rigid(model, seen, self.planar)
-            if not self.has_attitude:
-                self.quat, self.level = quat, self.planar
-                self.quat[np.isnan(self.position[:, 0])] = np.nan
+            self.position, turned, _ = fit_rigid(model, seen, self.planar)
+            turned[np.isnan(self.position[:, 0])] = np.nan
+            if self.quat is not None:
+                self._check_heading(turned, self.quat)
+            if self.quat is None or self.level or not self.planar:
+                self.quat, self.level = turned, self.planar
+            else:  # from above, the attitude alone says roll and pitch
+                self.quat = np.where(np.isfinite(self.quat), self.quat, turned)
         else:
             self.position = self.seen[:, 0]
         if self.planar:
             self.position[:, 2] = np.nan
+
+    def _check_heading(self, turned: np.ndarray, quat: np.ndarray) -> None:
+        """Refuses `[n, 4]` attitudes that head elsewhere than the marks."""
+        both = np.isfinite(turned).all(1) & np.isfinite(quat).all(1)
+        off = np.abs(_turn_error(turned[None, both], quat[both], True))
+        if both.any() and (half := float(np.median(off))) > _OTHER_HEADING:
+            raise InputError(
+                f"{self.recording.name}: attitude", "as the marks turn, anticlockwise from above",
+                f"{half:.2g} rad off (--map yaw=COLUMN*-1?)",
+            )  # fmt: skip
 
     def _angle(self, hinge: str, at: np.ndarray) -> np.ndarray:
         if (signal := self.recording.signals.get(f"angle.{hinge}")) is not None:
@@ -704,8 +728,8 @@ class _View:
                 return left.reshape(*s.shape[:2], -1)
 
             add("marks", self.mark_time, off, seen.reshape(len(seen), -1))
-        if self.quat is not None and self.has_attitude:
-            level, quat = self.level, self.quat
+        if self.attitude is not None and np.isfinite(self.attitude[0]).all(1).any():
+            quat, level = self.attitude
             add("attitude", self.time, lambda s: _turn_error(s[..., 3:7], quat, level))
         if servos_free:
             time, values = self.recording.table([f"angle.{h}" for h in self.hinges])

@@ -36,6 +36,8 @@ from mjx_revolve.water.world import load_world, read_world_files
 
 # Of a state, what a checkpoint has as plain values.
 _PLAIN = ("noise", "common", "cost", "moved", "inflated")
+# What checkpoints of older versions, or of the first state, lack.
+_LATER = ("resets", "steps")
 
 
 @checked
@@ -232,14 +234,21 @@ class FitRun:
         checkpoint = self.folder.load_checkpoint()
         arrays, meta = checkpoint.arrays, checkpoint.meta
         roots, resets = self.problem.roots, self.problem.drive.resets
-        own = {**vars(self.problem.origin()), "roots": roots, "damping": resets}
+        origin = self.problem.origin()
+        own = {**vars(origin), "roots": roots, "damping": resets, "resets": resets,
+               "steps": origin.free}  # fmt: skip
         for name, like in own.items():
             shape = np.shape(arrays[name]) if name in arrays else None
-            if shape != np.shape(like):
+            if shape != np.shape(like) and (shape is not None or name not in _LATER):
                 found = f"{name} of shape {shape}"
                 raise InputError(checkpoint.path, "a checkpoint of this fit", found)
         if missing := [name for name in _PLAIN if name not in meta]:
             raise InputError(checkpoint.path, "a checkpoint of a fit", f"no {missing[0]}")
+        if not isinstance(meta["noise"], dict) or (
+            missing := sorted({c.kind for c in self.problem.channels} - meta["noise"].keys())
+        ):
+            found = f"one without {', '.join(missing) or 'noise'}; begin it anew"
+            raise InputError(checkpoint.path, "a checkpoint of this fit", found)
         self.folder.rewind(checkpoint)
         roots[:] = arrays["roots"]
         resets[:] = arrays.get("resets", resets)  # folders of older versions have no cut windows

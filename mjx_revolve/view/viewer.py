@@ -190,7 +190,7 @@ def _fit(
         count, size = sum(map(len, rows)), len(packed["poses"])
         if size <= room or gap > longest:  # what is left is in the window
             break
-    return count, gap if count < total else 0.0, packed
+    return count, min(gap, longest) if count < total else 0.0, packed
 
 
 def _thin(time: np.ndarray, gap: float, window: tuple[float, float] | None) -> np.ndarray:

@@ -70,8 +70,6 @@ def test_defaults(folder):
          "high: 1}, b: {low: 0, high: 1}}}}", "bodies.selection.objectives: expected score, as"),
 ("task.durtion=5", "--set task.durtion: expected one of 32 keys; found an unknown key; "
          "did you mean task.duration?"),
-("task.robust=1.5", "--set task.robust: expected true, false or a mapping, such as {drag: 1.3}; "
-         "found 1.5"),
 ("task.depth_tol=1", "; did you mean task.depth_tolerance?"),
 ("bodies.passport=required", "found an unknown key; did you mean bodies.selection.passport?"),
 ("world={density: 1}", "expected a `name` (a world's name or path) beside the overrides"),

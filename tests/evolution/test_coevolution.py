@@ -105,7 +105,10 @@ def test_learning_improves_and_is_what_counts(folder):
         assert score[0] == pytest.approx(individual.score, abs=1e-6)
 
 
-@pytest.mark.parametrize("lasts", ["joint_checks", "step_changes", "kept_shares"])
+LONG = pytest.param("joint_checks", marks=pytest.mark.long)  # it swims for each of them
+
+
+@pytest.mark.parametrize("lasts", [LONG, "step_changes", "kept_shares"])
 def test_where_a_passport_is_required_the_living_are_candidates_too(folder, monkeypatch, lasts):
     """What all elites fail the last of the other living passes, tried second: its joints alone do
     what servos can, or its score alone holds at half the step, or for two minutes."""

@@ -140,8 +140,7 @@ def make_film(episode: Episode, size: tuple[int, int] = (640, 480), fps: int = 3
     parts = pose_robot(robot, qpos).parts
     center, radius = enclosing_balls(parts, np.linalg.norm(robot.fluid.half_size, axis=1))
     period = stroke_period(time, qpos[:, 7:])
-    step = float(np.diff(rows).mean()) if len(rows) > 1 else world.timestep
-    before = np.round((time - rows[0]) / step).astype(int)
+    before = np.searchsorted(rows, time + 1e-6, "right") - 1
     water = water_at(world, before, time, len(rows), episode.water)
     shots = plan_shots(
         time,
