@@ -58,7 +58,7 @@ class Episode:
         fitness: of the run, or None.
         folder: the run folder, or None.
         starts: those over which the score is the mean, in words.
-        task: of the run, or None; of `fitness` where there is one.
+        task: of the run, or None.
     """
 
     title: str
@@ -72,11 +72,6 @@ class Episode:
     folder: Path | None = None
     starts: str = "fresh starts"
     task: TaskConfig | None = None
-
-    def __post_init__(self) -> None:
-        """Takes the task of the fitness."""
-        if self.task is None and self.fitness is not None:
-            object.__setattr__(self, "task", self.fitness.config.task)
 
     __repr__ = short_repr
 
