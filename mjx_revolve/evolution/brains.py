@@ -243,7 +243,7 @@ class PatternNetwork:
         for k in range(_HIDDEN):
             hidden[..., k] = _FUNCTIONS[k % len(_FUNCTIONS)](hidden[..., k])
         seen = np.concatenate([hidden, np.broadcast_to(x, (len(flat), *x.shape))], -1)
-        weights = flat[:, self.first : self.second].reshape(-1, *self.shapes[1])
+        weights = flat[:, self.first : self.second].reshape(len(flat), *self.shapes[1])
         outputs = np.einsum("voh,vnh->vno", weights, seen)
         genes = np.zeros((len(flat), layout.width), np.float32)
         for k, gene in enumerate(layout.genes):

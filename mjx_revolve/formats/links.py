@@ -194,7 +194,8 @@ def rest_pose(links: tuple[Link, ...], index: int) -> tuple[np.ndarray, np.ndarr
 
 def plain(name: str) -> str:
     """A name of letters, digits and _ only, as ROS, Gazebo and XML all take it."""
-    return re.sub(r"[^A-Za-z0-9_]", "_", name) or "_"
+    found = re.sub(r"[^A-Za-z0-9_]", "_", name) or "_"
+    return f"m{found}" if re.fullmatch("__.*__", found) else found  # which Gazebo reserves
 
 
 def roll_pitch_yaw(rotation: np.ndarray) -> np.ndarray:

@@ -38,6 +38,7 @@ from mjx_revolve.numerics.spatial import quat_to_matrix
 from mjx_revolve.water.buoyancy import find_buoyancy_law
 from mjx_revolve.water.drag import find_drag_law
 from mjx_revolve.water.face_drag import FACES, FaceNumbers
+from mjx_revolve.water.fossen import FOSSEN
 from mjx_revolve.water.laws import part_numbers
 from mjx_revolve.water.lift_drag import LIFT_DRAG, PlateNumbers
 from mjx_revolve.water.thrusters import thrust
@@ -82,9 +83,9 @@ def make_sdf(robot: Robot, meshes: str = "meshes/", start: np.ndarray | None = N
     model = node(
         "model",
         _pose(start[:3], quat_to_matrix(start[3:7] / np.linalg.norm(start[3:7]))),
-        node("self_collide", robot.world.self_contact),
+        node("self_collide", len(robot.assembly.meeting_pairs) > 0),
         *(one for link in links for one in _link(robot, links, link, meshes)),
-        *(_hinge(link, links[link.parent]) for link in links[1:]),
+        *(_hinge(robot, link, links[link.parent]) for link in links[1:]),
         *(one for link in links for one in _forces(robot, link)),
         _plugin("joint-state-publisher", "JointStatePublisher"),
         _plugin(
@@ -244,13 +245,16 @@ def _rotor(part: PlacedPart, name: str) -> Iterator[Element]:
     yield node("joint", *ends, axis, name=f"{name}_joint", type="revolute")
 
 
-def _hinge(link: Link, parent: Link) -> Element:
-    joint = link.joint
+def _hinge(robot: Robot, link: Link, parent: Link) -> Element:
+    joint, module = link.joint, robot.fluid.module
     assert joint is not None
+    # Links that a joint connects do not collide: a hinge's own two parts overlap.
+    own = module[link.parts[0].row]
+    frame = next(part for part in parent.parts if module[part.row] == own)
     return node(
         "joint",
         _pose(np.zeros(3), np.eye(3), relative_to=link.name),
-        *nodes(parent=parent.parts[0].name, child=link.parts[0].name),
+        *nodes(parent=frame.name, child=link.parts[0].name),
         node(
             "axis",
             node("xyz", joint.axis),
@@ -294,8 +298,10 @@ def _face_drag(robot: Robot, part: PlacedPart) -> Element:
 
 def _stated_drag(robot: Robot, part: PlacedPart) -> Element:
     """Damping that a module states itself."""
-    stated = robot.fluid.parameters["fossen"][part.row]
-    return _damping(robot, part, stated.quadratic_damping, np.array(stated.linear_damping))
+    numbers = part_numbers(FOSSEN, robot.fluid, robot.world)
+    n = jax.tree.map(lambda x: np.asarray(x)[part.row], numbers)
+    linear = np.block([[n.linear, n.cross.T], [n.cross, n.angular]])
+    return _damping(robot, part, [*n.quadratic, *n.angular_quadratic], linear)
 
 
 def _damping(

@@ -179,7 +179,7 @@ def draw_cppn(
 
 
 def mutate_cppn(rng: np.random.Generator, network: CPPN, settings: CPPNSettings) -> CPPN:
-    """A mutant of a network, different at least in one weight."""
+    """A mutant of a network; of functions that are drawn anew some stay."""
     changes = [
         (settings.add_node, _add_node),
         (settings.add_link, _add_link),

@@ -349,7 +349,7 @@ def _draw_rules(
 def _mutate(
     rng: np.random.Generator, grammar: Grammar, names: Sequence[str], settings: PlasticodingSettings
 ) -> Grammar | None:
-    """One letter added, deleted or exchanged in a rule that is used; None if impossible."""
+    """One letter added, deleted or exchanged in a rule within reach; None if impossible."""
     letter = pick(rng, _used(grammar.rules))
     rule = [*grammar.rules[letter]]
     first = int(letter == CORE)  # the core's letter stays at the beginning of its rule

@@ -116,9 +116,9 @@ def _describe(kind: ModuleType, part: Part) -> str:
     elif part.lift_drag is not None:
         words.append("fin")
     if kind.hinge is not None:
-        words.append(
-            "fixed to the parent" if part is kind.parts[0] else "moves; the servo, to buy, is in it"
-        )
+        servo = max(kind.parts[1:], key=lambda one: one.total_mass, default=None)
+        moves = "moves; the servo, to buy, is in it" if part is servo else "moves"
+        words.append("fixed to the parent" if part is kind.parts[0] else moves)
     # Of material and sealed volume the centre of both is given: the material's is taken to be the
     # box's, unless what is sealed would lie outside of it.
     sealed, joint = "sealed volume", np.asarray(part.center_of_volume)
@@ -139,7 +139,8 @@ def _describe(kind: ModuleType, part: Part) -> str:
 
 def weigh(robot: Robot) -> Balance:
     """Mass, displaced volume and their centres, the robot at rest."""
-    body, density = robot.morphology, robot.world.density
+    body, world = robot.morphology, robot.world
+    density = 0.0 if world.buoyancy == "off" else world.density
     mass, volume, sealed = 0.0, 0.0, 0.0
     weighed, lifted = np.zeros(3), np.zeros(3)
     for module in body.modules:
@@ -166,7 +167,7 @@ def weigh(robot: Robot) -> Balance:
 def ballast_words(balance: Balance) -> list[str]:
     """How to make a robot neutral in its water: ballast or floats and their place, by sentence."""
     if not balance.density:
-        return ["The world of this robot has no water: nothing is said about ballast."]
+        return ["Its world has no water, or none that lifts: nothing is said about ballast."]
     water = f"water of {balance.density:.6g} kg/m³"
     found = []
     if balance.sealed:
@@ -220,7 +221,8 @@ def joint_rows(robot: Robot) -> list[dict[str, object]]:
         axis = module.rotation @ np.asarray(hinge.axis)
         ends = [slot.position for slot in module.kind.slots.values()]
         ends.append(module.kind.parts[-1].position)
-        motion = np.cross(axis, module.rotation @ np.subtract(ends[0], hinge.anchor))
+        ways = [np.cross(axis, module.rotation @ np.subtract(x, hinge.anchor)) for x in ends]
+        motion = max(ways, key=lambda way: float(np.linalg.norm(way)) > 1e-9)  # the first of them
         toward = _axis_words(motion / max(float(np.linalg.norm(motion)), 1e-12))
         parent = body.modules[module.parent].name
         rows.append(

@@ -176,10 +176,6 @@ HINGE = Hinge((0, 1, 0), (0, 0, 0), (-1, 1), 1.0, 1.0)
     [
         (lambda: Box((1, 0, 1)), "box: size.1: expected a number > 0 [m]; found 0"),
         (lambda: replace(PART, name="a/b"), "_ or -, beginning with a letter; found 'a/b'"),
-        (
-            lambda: replace(PART, buoyancy="some"),
-            "part 'p': buoyancy: expected one of partial, mask, off; found 'some'",
-        ),
         (lambda: replace(HINGE, range=(0.5, 1)), "hinge: range: expected [lowest, highest] around"),
         (lambda: ModuleType("M", (replace(PART, mass=0),)), "expected a core heavier than 0 kg"),
     ],

@@ -16,6 +16,7 @@ from mjx_revolve.control.sensory_cpg import make_sensory_cpg
 from mjx_revolve.control.splines import make_splines
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.episodes.config import ControllerConfig
+from mjx_revolve.inputs.errors import InputError
 
 DT, REACH = 0.005, np.pi / 4
 SENSORS = tuple(Sensor(type=name) for name in ("gyro", "depth", "angle", "speed", "contact"))
@@ -69,6 +70,8 @@ def test_zero_genes_keep_still_whatever_is_felt(kind, name):
 def test_genes_have_names_of_their_own_and_places(kind):
     controller = make(kind, plant_of(dry_robot("spider")))
     assert len(set(controller.gene_names)) == controller.num_genes == len(set(controller.genes))
+    with pytest.raises(InputError, match=r"^sensors.name: .*; found z$"):
+        make_joint_network(plant_of(dry_robot("spider")), (Sensor(type="depth", name="z"),))
 
 
 @pytest.mark.slow

@@ -50,18 +50,13 @@ def test_defaults(folder):
          "follow_bed; found none"),
 ("task={type: reach_target, target: [1, 0, 0], target_distance: 1}", "task.target: "
          "expected none, as there is a target_distance; found one"),
-("task={type: speed, target_speed: 1, target_turn: 1}", "task.target: expected three "
-         "numbers [m], or target_distance, as there is a target_turn; found none"),
 ("task={type: follow_course, course_spread: 1, direction: [0, 0, 1]}", "task.direction: "
          "expected one that is not upright, as there is a course_spread, which is level; found"),
-("bodies={selection: {novelty: [mass]}}", "bodies.selection.novelty: expected none, as novelty is"),
 ("colony={look: 4}", "colony.look: expected a whole part of the interval (10 s); found 4"),
 ("controller={type: sine, harmonics: 8}", "controller.max_frequency: expected at most half of "
          "controller.rate (20 Hz), to be sampled by it, of the last of 8 harmonics; found 2"),
 ("controller.harmonics=3", "--set controller.harmonics: expected 1, as only type sine has "
          "it (--set controller.harmonics=1); found 3"),
-("controller.sensors=[gyro]", "--set controller.sensors: expected null, as only types mlp, "
-         "rnn, sensory_cpg have it (--set controller.sensors=null); found 1 of them"),
 ("task={type: speed, duration: 6, horizon: 3}", "--set task.horizon: expected a time >= "
          "task.duration (6 s); found 3"),
 ("bodies={archive: &a {axes: {a: {low: 0, high: 1, cells: 9999}, b: {low: 0, high: 1, cells: "
@@ -86,7 +81,6 @@ def test_wrong_settings(folder, setting, message):
     [
 ("body: {type: Core}", "bad.yaml: expected a configuration; found a robot"),
 (GOOD + "  duration: -3", "bad.yaml: task.duration: expected a number > 0 and <="),
-(GOOD + "world: lake", "bad.yaml: line 6: expected each key once; found 'world' twice"),
 (GOOD.replace("lake", "no/pond.yaml"), "bad.yaml: world: expected a file; found none at"),
 (GOOD.replace("type: directed_swim", "trials: 2"), "bad.yaml: task.type: expected one of")
 ],

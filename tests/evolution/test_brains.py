@@ -8,6 +8,7 @@ import pytest
 from laboratory import body
 from mjx_revolve.body.edits import add_module, remove_module, swap_subtrees
 from mjx_revolve.control.cpg import make_cpg
+from mjx_revolve.control.joint_network import make_joint_network
 from mjx_revolve.control.sine import make_sine
 from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import build_robot
@@ -59,15 +60,19 @@ def test_places_of_genes():
             np.testing.assert_allclose(reach, anchors[j] - anchors[i], atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    "make", [make_sine, make_joint_network]
+)  # of the latter no gene has a place
 @pytest.mark.parametrize("kind", ["joints", "cppn"])
-def test_vectors_and_files_keep_all_bits(kind):
-    brains = make_brain_encoding(BrainsConfig(type=kind), common())
-    layout = layout_of(shorter(), common=common())
+def test_vectors_and_files_keep_all_bits(kind, make):
+    brains = make_brain_encoding(BrainsConfig(type=kind), common(make))
+    layout = layout_of(shorter(), make, common(make))
     brain = brains.draw(np.random.default_rng(3), layout)
     vector = brains.to_vector(brain, layout)
     assert vector.shape == (brains.size,) and vector.dtype == np.float32
     assert brains.from_vector(vector, layout) == brain
     assert brains.check(json.loads(json.dumps(brain))) == brain
+    assert brains.express(vector[None], layout).shape == (1, common(make).num_genes)
 
 
 @pytest.mark.parametrize("kind", ["joints", "cppn"])

@@ -11,7 +11,7 @@ from laboratory import body
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.formats.inertias import propeller
-from mjx_revolve.formats.links import make_links, rest_pose
+from mjx_revolve.formats.links import make_links, plain, rest_pose
 from mjx_revolve.formats.sdf import make_sdf
 from mjx_revolve.numerics.spatial import quat_to_matrix
 from mjx_revolve.water.drag import DRAG_LAWS
@@ -161,6 +161,8 @@ def test_sdf_refers_to_what_is_there(robot):
         assert plugin.findtext("joint_name") in {*joints, None}
     for link in make_links(robot)[1:]:
         joint = joints[link.joint.name]
+        module = robot.mj_model.body(link.body).name  # its two parts overlap: joined, they may
+        assert joint.findtext("parent").startswith(f"{plain(module)}_")
         limit = joint.find("axis/limit")
         assert pose_of(joint)[2] == link.name
         np.testing.assert_allclose(np.array(joint.findtext("axis/xyz").split(), float), [0, 1, 0])
