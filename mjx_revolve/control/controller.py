@@ -24,6 +24,7 @@ from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.control.sensors import Observer
 from mjx_revolve.engine.plant import Plant, plant_of
 from mjx_revolve.engine.robot import Robot
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.spatial import Scalar
 
 # How long commands take to fade in, so that no joint jumps at the start [s]; a choice.
@@ -209,6 +210,13 @@ def gene_indices(own: Controller, common: Controller) -> np.ndarray:
     Args:
         own: made for the body's plant.
         common: of the same kind, made for the largest body there may be.
+
+    Raises:
+        InputError: two genes have one name, as a sensor is called like another input.
     """
     place = {gene: k for k, gene in enumerate(common.genes)}
+    if len(place) < len(common.genes):
+        twice = next(gene for k, gene in enumerate(common.genes) if place[gene] > k)
+        known = "names that no other input of the network has"
+        raise InputError("controller.sensors", known, f"two genes {twice.what}")
     return np.array([place[gene] for gene in own.genes], int)

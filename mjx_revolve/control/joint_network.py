@@ -30,7 +30,6 @@ from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.control.sensors import make_observer
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.spatial import sincos
 from mjx_revolve.numerics.xla import materialize
 
@@ -90,9 +89,6 @@ def make_joint_network(
     given = [*observer.robot_names, *(f"joint {x}" for x in observer.joint_names)]
     fixed, shared = len(_PLACE), len(observer.robot_names)
     inputs = [*_PLACE, *given, *_HINTS, *words]
-    if twice := {*observer.robot_names} & {*_PLACE, *_HINTS, *words}:
-        known = "names that no other input of the network has"
-        raise InputError("sensors.name", known, ", ".join(sorted(twice)))
     outputs = ["target", *words]
     units = [f"h{k + 1}" for k in range(hidden)]
     names = [f"{x}>{h}" for h in units for x in inputs]

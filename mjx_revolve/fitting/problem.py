@@ -597,6 +597,8 @@ class _View:
             self.quat = Rotation.from_euler("ZYX", np.stack(turns, -1)).as_quat(scalar_first=True)
             self.quat[gap(signals["yaw"].time, self.time)] = np.nan
             self.level = "roll" not in signals
+        if self.quat is not None and not np.isfinite(self.quat).all(1).any():
+            self.quat, self.level = None, False
         self.attitude = None if self.quat is None else (self.quat, self.level)
         if self.names:
             self._fit_marks()
@@ -604,9 +606,11 @@ class _View:
             self.quat = None
         spans = {n: s.time for n, s in signals.items()
                  if "mean_speed" in signals or not n.startswith(_SENT)}  # fmt: skip
-        late = () if "mean_speed" in signals else (*_TURNS, "qw", "qx", "qy", "qz")
-        self.begin = min(float(t[0]) for n, t in spans.items() if n not in late)
-        self.end = max(float(t[-1]) for t in spans.values())
+        beside = () if "x" in signals else ("qw", "qx", "qy", "qz")
+        between = () if "mean_speed" in signals else (*_TURNS, *beside)
+        kept = [t for n, t in spans.items() if n not in between]
+        self.begin = min(float(t[0]) for t in kept)
+        self.end = max(float(t[-1]) for t in kept)
 
     def check_frames(self, window: float) -> None:
         """Refuses a recording of which a window has no two frames."""
@@ -728,7 +732,7 @@ class _View:
                 return left.reshape(*s.shape[:2], -1)
 
             add("marks", self.mark_time, off, seen.reshape(len(seen), -1))
-        if self.attitude is not None and np.isfinite(self.attitude[0]).all(1).any():
+        if self.attitude is not None:
             quat, level = self.attitude
             add("attitude", self.time, lambda s: _turn_error(s[..., 3:7], quat, level))
         if servos_free:

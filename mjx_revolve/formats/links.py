@@ -195,7 +195,7 @@ def rest_pose(links: tuple[Link, ...], index: int) -> tuple[np.ndarray, np.ndarr
 def plain(name: str) -> str:
     """A name of letters, digits and _ only, as ROS, Gazebo and XML all take it."""
     found = re.sub(r"[^A-Za-z0-9_]", "_", name) or "_"
-    return f"m{found}" if re.fullmatch("__.*__", found) else found  # which Gazebo reserves
+    return f"m{found}" if re.fullmatch("world|__.*__", found) else found  # which Gazebo reserves
 
 
 def roll_pitch_yaw(rotation: np.ndarray) -> np.ndarray:

@@ -96,7 +96,7 @@ def make_sdf(robot: Robot, meshes: str = "meshes/", start: np.ndarray | None = N
             dimensions=3,
         ),
         name=name,
-        canonical_link=links[0].parts[0].name,
+        canonical_link=_root(robot, links[0]).name,
     )
     world = node("world", *_surroundings(robot), model, name=plain(f"{name}_{robot.world.name}"))
     note = _NOTE.format(
@@ -187,9 +187,9 @@ def _floats(robot: Robot) -> bool:
 
 
 def _link(robot: Robot, links: tuple[Link, ...], link: Link, meshes: str) -> Iterator[Element]:
-    """The link's own frame, and its parts as links that are welded to the first of them."""
+    """The link's own frame, and its parts as links that are welded to one of them."""
     position, rotation = rest_pose(links, link.body - 1)
-    first = link.parts[0]
+    first = _root(robot, link)
     back = first.rotation.T
     place = _pose(-back @ first.position, back, relative_to=first.name)
     yield node("frame", place, name=link.name, attached_to=first.name)
@@ -245,16 +245,30 @@ def _rotor(part: PlacedPart, name: str) -> Iterator[Element]:
     yield node("joint", *ends, axis, name=f"{name}_joint", type="revolute")
 
 
+def _is_solid(robot: Robot, part: PlacedPart) -> bool:
+    """Whether others collide with it."""
+    return part.part.contact and robot.fluid.volume[part.row] > 0
+
+
+def _root(robot: Robot, link: Link) -> PlacedPart:
+    """The part that joints connect: links that none connects collide."""
+    return next((part for part in link.parts if _is_solid(robot, part)), link.parts[0])
+
+
 def _hinge(robot: Robot, link: Link, parent: Link) -> Element:
     joint, module = link.joint, robot.fluid.module
     assert joint is not None
-    # Links that a joint connects do not collide: a hinge's own two parts overlap.
-    own = module[link.parts[0].row]
-    frame = next(part for part in parent.parts if module[part.row] == own)
+    # A hinge's own two parts overlap; what has none to collide, overlaps the module before it.
+    own = int(module[link.parts[0].row])
+    for k in (own, robot.morphology.modules[own].parent):
+        around = [p for p in parent.parts if module[p.row] == k and _is_solid(robot, p)]
+        if around:
+            break
+    frame = around[0] if around else _root(robot, parent)
     return node(
         "joint",
         _pose(np.zeros(3), np.eye(3), relative_to=link.name),
-        *nodes(parent=frame.name, child=link.parts[0].name),
+        *nodes(parent=frame.name, child=_root(robot, link).name),
         node(
             "axis",
             node("xyz", joint.axis),

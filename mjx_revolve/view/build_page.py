@@ -50,7 +50,7 @@ class Balance:
         mass: [g].
         displaced: volume of what it displaces, sealed volume and floats included [cm³].
         sealed: the part of it that is not of the parts' material [cm³].
-        density: of the water [kg/m³].
+        density: of the water [kg/m³]; 0 where nothing lifts.
         missing: volume that it would have to displace more to be neutral [cm³].
         mass_center: at rest, core frame [mm].
         lift_center: of what is displaced [mm].

@@ -8,6 +8,7 @@ from scipy.interpolate import CubicSpline
 
 from laboratory import check_slope_at_rest, dry_robot, elbow_robot, play, world
 from mjx_revolve.body.sensors import Sensor
+from mjx_revolve.control.controller import gene_indices
 from mjx_revolve.control.gait import describe_gait
 from mjx_revolve.control.joint_network import make_joint_network
 from mjx_revolve.control.kinds import find_controller
@@ -70,8 +71,9 @@ def test_zero_genes_keep_still_whatever_is_felt(kind, name):
 def test_genes_have_names_of_their_own_and_places(kind):
     controller = make(kind, plant_of(dry_robot("spider")))
     assert len(set(controller.gene_names)) == controller.num_genes == len(set(controller.genes))
-    with pytest.raises(InputError, match=r"^sensors.name: .*; found z$"):
-        make_joint_network(plant_of(dry_robot("spider")), (Sensor(type="depth", name="z"),))
+    unclear = make_joint_network(plant_of(dry_robot("spider")), (Sensor(type="depth", name="z"),))
+    with pytest.raises(InputError, match=r"^controller.sensors: .*; found two genes z>h1$"):
+        gene_indices(unclear, unclear)
 
 
 @pytest.mark.slow

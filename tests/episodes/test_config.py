@@ -68,8 +68,6 @@ def test_defaults(folder):
 ("task.depth_tol=1", "; did you mean task.depth_tolerance?"),
 ("bodies.passport=required", "found an unknown key; did you mean bodies.selection.passport?"),
 ("world={density: 1}", "expected a `name` (a world's name or path) beside the overrides"),
-("task.type.deep.deeper=1", "--set task.type.deep.deeper: expected task.type to be a "
-         "mapping; found 'directed_swim'")
 ],
 )  # fmt: skip
 def test_wrong_settings(folder, setting, message):
