@@ -182,15 +182,14 @@ def _finish(run: FitRun, interrupts: Interrupts) -> int:
 
 def describe(fit: Fit) -> list[str]:
     """What a fit has found, in lines."""
-    from mjx_revolve.fitting.problem import LOCAL_UNITS, NOISE
+    from mjx_revolve.fitting.problem import NOISE
 
     lines = []
     for v in fit.values:
         unit = v.unit or "times what it was"
         ends = f"[{v.low:.4g}, {v.high:.4g}]" if v.found else "(not found by itself)"
         lines.append(f"{v.name}: {v.value:.4g} {unit} {ends}")
-    for r, n, x, s in fit.local:
-        lines.append(f"{r}: {n} {x:.3g} ± {1.96 * s:.2g} {LOCAL_UNITS[n.partition('_')[0]]}")
+    lines += [f"{r}: {n} {words}" for r, n, words in fit.local_words]
     lines += [f"{u.words}: the recordings do not determine more" for u in fit.unknown]
     for p in fit.predictions:
         held = bool(p.held.any())

@@ -14,7 +14,7 @@ from mjx_revolve.fitting.estimate import FitState, Model, advance, begin, linear
 from mjx_revolve.fitting.identify import Unknown, find_unknown, is_found, plan_motions
 from mjx_revolve.fitting.intervals import LEVEL, Estimate, estimate
 from mjx_revolve.fitting.parameters import entries_of, split_free, with_values
-from mjx_revolve.fitting.problem import FitProblem, FitSettings, make_problem
+from mjx_revolve.fitting.problem import LOCAL_UNITS, FitProblem, FitSettings, make_problem
 from mjx_revolve.fitting.recording import RobotRecording
 from mjx_revolve.inputs.yaml_reader import dump_yaml
 
@@ -110,6 +110,14 @@ class Fit:
     def robot(self) -> Robot:
         """The robot with the numbers found."""
         return with_values(self.problem.robot, self.problem.parameters, self.state.point.free)
+
+    @property
+    def local_words(self) -> list[tuple[str, str, str]]:
+        """`local` with its value in words: with half of its 95 % interval, and the unit."""
+        return [
+            (r, n, f"{x:.3g} ± {1.96 * s:.2g} {LOCAL_UNITS[n.partition('_')[0]]}")
+            for r, n, x, s in self.local
+        ]
 
     @property
     def coefficients(self) -> dict[str, dict[str, Any]]:

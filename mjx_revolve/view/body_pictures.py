@@ -98,14 +98,8 @@ def plot_best(folder: Path, modules: Mapping[str, ModuleType], title: str = "") 
     for axes, picture, life in zip(grid.flat, pictures, best, strict=False):
         axes.imshow(picture, interpolation="lanczos")
         look: dict[str, Any] = {"ha": "center", "va": "top", "transform": axes.transAxes}
-        axes.text(
-            0.5,
-            -0.01,
-            f"{life.number}: {format_number(life.score)}",
-            fontsize=9.5,
-            color=INK,
-            **look,
-        )
+        words = f"{life.number}: {format_number(life.score)}"
+        axes.text(0.5, -0.01, words, fontsize=9.5, color=INK, **look)
         axes.text(0.5, -0.12, count_modules(life), fontsize=8.5, color="#5b6a75", **look)
     return figure
 

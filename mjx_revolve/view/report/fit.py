@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mjx_revolve.fitting.intervals import LEVEL
-from mjx_revolve.fitting.problem import LOCAL_UNITS
 from mjx_revolve.fitting.result import Fit, Prediction
 from mjx_revolve.view.plots import BLUE, GREY, INK, ORANGE, WIDE, in_style, new_figure, thin
 from mjx_revolve.view.report.page import make_page, sections, svg_source
@@ -135,12 +134,8 @@ def _recordings(fit: Fit) -> str:
             ", ".join(f"{kind} ({len(time)})" for kind, time in kinds.items()),
             "; ".join(recording.notes) or "none",
         ))  # fmt: skip
-    own = [
-        (r, n, f"{x:.3g} ± {1.96 * s:.2g} {LOCAL_UNITS[n.partition('_')[0]]}")
-        for r, n, x, s in fit.local
-    ]
     noise = [
         (kind, f"{sigma:.3g}", f"{fit.estimate.inflation.get(kind, 1.0):.2g}")
         for kind, sigma in fit.estimate.noise.items()
     ]
-    return sections.fit_recordings(rows, own, noise)
+    return sections.fit_recordings(rows, fit.local_words, noise)
