@@ -92,9 +92,25 @@ def read_rows(name: str, rows: str, folder: Path = RESULTS) -> list[dict[str, An
 
     Returns:
         The rows; none where there is no file.
+
+    Raises:
+        InputError: they are of another machine.
     """
     path = folder / f"{name}.json"
-    return json.loads(path.read_text("utf-8"))["numbers"][rows] if path.exists() else []
+    if not path.exists():
+        return []
+    known = json.loads(path.read_text("utf-8"))
+    if (here := _machine()) != known["machine"]:
+        raise InputError(str(path), f"rows of this machine, {here}", f"those of {known['machine']}")
+    return known["numbers"][rows]
+
+
+def _machine() -> dict[str, Any]:
+    """What times depend on."""
+    from mjx_revolve.numerics.runtime import describe_process
+
+    known = describe_process()
+    return {key: known[key] for key in ("cpu", "cpu_count", "device")}
 
 
 def _study_hash() -> str:
@@ -129,7 +145,7 @@ def write_results(
         "study": name,
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "versions": known["versions"] | {"source": source_hash(), "study": _study_hash()},
-        "machine": {key: known[key] for key in ("cpu", "cpu_count", "device")},
+        "machine": _machine(),
         "seeds": list(seeds),
         "numbers": numbers,
     }

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from typing import Any
 
 from experiments.bench_cases import PHYSICS
-from experiments.common import ROOT, make_folder, make_parser, write_results
+from experiments.common import RESULTS, ROOT, make_folder, make_parser, write_results
 from mjx_revolve.body.table import align
 from mjx_revolve.inputs.commands import run_command, whole
 from mjx_revolve.inputs.errors import InputError
@@ -94,6 +94,8 @@ def make_warp(name: str, count: int, steps: int) -> Made:
     data = mujoco_warp.make_data(robot.mj_model, nworld=count)
 
     def advance() -> None:
+        mujoco_warp.reset_data(model, data)
+        data.ctrl.fill_(0.3)
         for _ in range(steps):
             mujoco_warp.step(model, data)
 
@@ -174,7 +176,7 @@ def main(argv: list[str] | None = None) -> int:
         )  # fmt: skip
         rows.append((row["engine"], str(row["population"]), *rates))
     print("\n".join(align(rows)))
-    folder = make_folder(options.out, "gpu")
+    folder = RESULTS if options.results else make_folder(options.out, "gpu")
     done, missing = ([row for row in found if ("error" in row) == bad] for bad in (False, True))
     numbers = {
         "platform": device.platform, "robot": options.robot, "rows": done, "missing": missing

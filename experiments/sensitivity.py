@@ -431,6 +431,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--no-laws", action="store_true", help="leave out the table of the laws")
     options = parser.parse_args(argv)
     check_whole(parser, options, "no_laws")
+    if options.results and not options.robust:
+        raise InputError("--results", "a run to stand beside, by --robust", "none")
     champion = read_champion(Path(options.run))
     others = {"evolved with robust": options.robust} if options.robust else {}
     rivals = {name: read_champion(Path(run)) for name, run in others.items()}

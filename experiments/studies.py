@@ -111,6 +111,8 @@ def study_main(
     elif code := run_study(plans, name, argv):
         return code
     outcomes = judge_champions(read_outcomes(plans, add))
+    if options.results and len(outcomes) < len(plans):
+        raise InputError("--results", f"{len(plans)} finished runs", len(outcomes))
     numbers = write_report(folder, outcomes)
     for run in numbers["runs"]:
         print(f"{run['name']}: {run['score']['text']} body lengths/s, {run['seeds']} seeds")
