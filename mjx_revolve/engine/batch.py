@@ -515,7 +515,7 @@ def _constants(level: Level, kinds: Sequence[ModuleType], world: World) -> Level
 
 
 def _hinge_numbers(kind: ModuleType) -> tuple[Any, ...]:
-    """What hinges of a type have in common, as `robot` and `columns` make it."""
+    """What hinges of a type have in common, as `robot` and `step_constants` make it."""
     hinge = kind.hinge
     assert hinge is not None
     damping = FRICTION * hinge.effort / hinge.speed
@@ -624,7 +624,7 @@ def _alike(columns: StepConstants, nothing: Parts) -> StepConstants:
 def pack_bodies(
     robots: Sequence[Robot], capacity: Capacity, dtype: Any = np.float32
 ) -> PackedBodies:
-    """Robots side by side, as `rows.BatchedTrees` takes them.
+    """Robots side by side, as `batched_trees.BatchedTrees` takes them.
 
     Args:
         robots: one for each individual; the same object may stand there many times.

@@ -354,8 +354,8 @@ def midpoint_forces(
     """`water_forces` in the middle of the step, and what damps them as far as a step needs it.
 
     They are those of the velocity ν + (1 - s) dt/2 ν'₋, with the acceleration ν'₋ of the step
-    before, and fall by s dt D ν' with the acceleration ν' that is sought; D is the half of the
-    forces' gradient that the laws give, none of explicit ones. Without the share s that is second
+    before, and fall by s dt D ν' with the acceleration ν' that is sought; D is the damping that the
+    laws give (see `laws.Drag`), none of explicit ones. Without the share s that is second
     order, but unstable for a body that the water slows down within a step; s = 1 is linearly
     implicit, stable, and of first order in what D leaves out: joints' accelerations jump with their
     commands. See `implicit_share`. The slam takes what the step begins with: momentum is then kept.

@@ -3,7 +3,8 @@
 In the frame of the uniform current, from the very forces that a step adds up. As a step is
 implicit, they are taken at the places of its beginning and the velocities of its end; over the mean
 of the velocities at both ends they then do the work by which a semi-implicit step changes kinetic
-energy. What is left closes to the first order of the step.
+energy. What is left closes to the first order of the step. Water that joins a robot at the surface
+is taken along by the slam, and water that leaves it keeps its energy: both count as drag.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 
 from mjx_revolve.engine.contact import bed_forces
 from mjx_revolve.engine.dynamics import accelerate, inertia_and_momentum
-from mjx_revolve.engine.hydrodynamics import water_forces
+from mjx_revolve.engine.hydrodynamics import ExternalForces, PreviousStep, water_forces
 from mjx_revolve.engine.kinematics import forward_kinematics
 from mjx_revolve.engine.level import Level
 from mjx_revolve.engine.plant import actuators_of
@@ -40,6 +41,7 @@ from mjx_revolve.numerics.spatial import (
     mul,
     neg,
     quat_to_mat,
+    sub,
     vadd,
     vscale,
     vsub,
@@ -61,7 +63,7 @@ class EnergyBalance(NamedTuple):
         given: the same with its sign.
         kinetic: gained, of the robot and of the water that it carries along.
         potential: gained, by weight and buoyancy.
-        drag: lost to the water.
+        drag: lost to the water, to slam and waves, too.
         contact: lost to the bed and to other modules.
         joints: lost in friction and end stops.
     """
@@ -131,6 +133,7 @@ def _powers(
     tree = tree.with_variation(variation)
     lanes, dt = ctrl.shape[1:], tree.world.timestep
     before, after = (init(tree, qpos[:, rows], qvel[:, rows]) for rows in (_BEGUN, _ENDED))
+    earlier = init(tree, jnp.concatenate([qpos[:, :1], qpos[:, :-2]], 1), qvel[:, _BEGUN])
     turn = quat_to_mat(before.quat)
     now, then = (vsub(x.velocity, water.current) for x in (before, after))
     # As a step has it, the velocity turns with the body.
@@ -144,12 +147,13 @@ def _powers(
     def whole(rates: Any) -> dict[str, jax.Array]:
         """Sums over the robot, with these velocities at the end of the step."""
         end = before._replace(**dict(zip(_RATES, rates, strict=True)))
-        motions = [forward_kinematics(tree, x, True) for x in (before, end)]
+        motions = [forward_kinematics(tree, x, True) for x in (before, end, earlier)]
         roots, moved = zip(*motions, strict=True)
         found = [_on_bodies(tree.world, tree.root, roots, water, thrusts)]
         below = zip(*moved, before.angle, before.speed, end.speed, targets, strict=True)
-        for level, (first, second, angle, *speeds, target) in zip(tree.below, below, strict=True):
-            found.append(_on_bodies(tree.world, level, (first[0], second[0]), water, thrusts))
+        for level, (*motion, angle, began, ends, target) in zip(tree.below, below, strict=True):
+            speeds = began, ends
+            found.append(_on_bodies(tree.world, level, [m[0] for m in motion], water, thrusts))
             found.append(_at_hinges(tree.world, level, angle, speeds, target, dt))
         sums: dict[str, jax.Array] = {}
         for name, x in (item for each in found for item in each.items()):
@@ -172,13 +176,13 @@ def _powers(
 
 
 def _on_bodies(
-    world: World, level: Level, motions: tuple[BodyMotion, BodyMotion], water: Water, thrusts: Any
+    world: World, level: Level, motions: Sequence[BodyMotion], water: Water, thrusts: Any
 ) -> dict[str, Scalar]:
     """Of water, weight and bed, on the bodies of a level, `[nbody, lanes]` each [J, W].
 
-    `motions`: at the step's beginning, and with the velocities of its end.
+    `motions`: at the step's beginning, with the velocities of its end, and a step before.
     """
-    begun, motion = ((x.angular_velocity, x.velocity) for x in motions)
+    begun, motion = ((x.angular_velocity, x.velocity) for x in motions[:2])
     mean = tuple(vscale(0.5, vadd(a, b)) for a, b in zip(begun, motion, strict=True))
     at = motions[1]
     gravity = effective_gravity(world, water, at)
@@ -187,16 +191,23 @@ def _on_bodies(
         return add(dot(velocity[0], torque), dot(velocity[1], force))
 
     parts = tuple(replace(p, laws=p.laws._replace(drag="off")) for p in level.parts)
-    no_drag = replace(world, drag="off"), replace(level, parts=parts), at, gravity, water
-    external = water_forces(world, level, at, gravity, water, thrusts)
+    calm = replace(world, drag="off", near_surface=False)
+    no_drag = calm, replace(level, parts=parts), at, gravity, water
+    past = water_forces(world, level, motions[2], gravity, water, thrusts)
+    previous = PreviousStep(past.submerged, world.timestep) if past.submerged else None
+    slammed = at._replace(begun=begun)
+    external = water_forces(world, level, slammed, gravity, water, thrusts, previous)
     driven = idle = water_forces(*no_drag, thrusts)
     if len(thrusts):
         idle = water_forces(*no_drag, jnp.zeros_like(thrusts))
     down = tuple(map(neg, gravity))
     fall = vadd(cross(level.moment, down), idle.torque), vadd(vscale(level.mass, down), idle.force)
-    before, after = (
-        mul(0.5, power(*inertia_and_momentum(level, external, x)[2], x)) for x in (begun, motion)
-    )
+
+    def kinetic(carrying: ExternalForces, velocity: Any) -> Scalar:
+        return mul(0.5, power(*inertia_and_momentum(level, carrying, velocity)[2], velocity))
+
+    before = kinetic(external, begun)
+    parted = mul(1 / world.timestep, sub(kinetic(past, begun), before))
     thrust = power(vsub(driven.torque, idle.torque), vsub(driven.force, idle.force))
     drag = power(vsub(external.torque, driven.torque), vsub(external.force, driven.force))
     bed: Scalar = 0.0
@@ -204,9 +215,9 @@ def _on_bodies(
         bed = power(*bed_forces(world, level, at, level.points, water)[:2])
     return {
         "kinetic_before": before,
-        "kinetic_after": after,
+        "kinetic_after": kinetic(external, motion),
         "potential": neg(power(*fall)),
-        "drag": neg(drag),
+        "drag": sub(parted, drag),
         "contact": neg(bed),
         "given": thrust,
         "work": jnp.abs(thrust),

@@ -196,12 +196,13 @@ def make_fluid_table(
     }
     more = factors.get("added_mass", np.ones(len(kind)))[:, None]
     known = known * more[..., None]
-    diagonal = np.einsum("pii->pi", known)
-    added_mass = np.where(stated[:, None], diagonal[:, :3], more * added_mass)
-    added_inertia = np.where(stated[:, None], diagonal[:, 3:], more * added_inertia)
     # Where the core states the water of all of its robot, other parts have none.
     whole = column(lambda p: p.fossen is not None and p.fossen.whole)
     replaced = np.isin(layout.body, layout.body[whole]) & ~whole
+    known[replaced] = 0.0
+    diagonal = np.einsum("pii->pi", known)
+    added_mass = np.where(stated[:, None], diagonal[:, :3], more * added_mass)
+    added_inertia = np.where(stated[:, None], diagonal[:, 3:], more * added_inertia)
     added_mass[replaced] = added_inertia[replaced] = 0.0
     drag = each([drag_law(p, world) for p in parts])
     if replaced.any() and world.drag != ELLIPSOID.name:  # MuJoCo's laws are for all parts

@@ -483,7 +483,7 @@ class PartForces(NamedTuple):
     Attributes:
         buoyancy: of the water's pressure: Archimedes', what accelerating water adds to it, and the
             pull of the surface where the world has one.
-        drag: of the water that flows past, the lift of fins included.
+        drag: of the water that flows past, and of radiated waves; the lift of fins included.
         thrust: of the thrusters.
     """
 
@@ -519,7 +519,11 @@ def forces_on_parts(
             lift = vadd(lift, _pressure(world, parts, at, gravity, wide)[1])
         law, drag = find_drag_law(parts.laws.drag), ZERO
         if isinstance(law, PartDragLaw):
-            drag = matvec(parts.rotation, law.force(at.flow, parts.drag, world).force)
+            drag = law.force(at.flow, parts.drag, world).force
+        close = _near_surface(world, parts, at, wide)
+        if close is not None and parts.carried is not None:
+            drag = vsub(drag, symvec(close.damping.linear, at.flow.velocity))
+        drag = matvec(parts.rotation, drag)
         push: Vec = ZERO
         if parts.mounts is not None:
             push = _thrust(parts.mounts, at.flow.submerged, thrusts)[1]

@@ -24,7 +24,8 @@ class Variation(NamedTuple):
     """Factors on coefficients of a world and its modules, `[lanes]` or a number each.
 
     Attributes:
-        drag: on the coefficients of the faces' drag, and of drag and lift of plates (fins).
+        drag: on the coefficients of the faces' drag, of drag and lift of plates (fins), of friction
+            and of stated damping.
         added_mass: on all water that parts carry along.
         density: of the water: on buoyancy, on these drags and on what is carried. Weights stay, so
             a robot that hovered no longer does. Thrusters keep their curves, which are measured.
@@ -73,7 +74,7 @@ def vary_thrusters(thrusters: Thrusters, variation: Variation) -> Thrusters:
 
 
 def _vary_hinges(hinges: Hinges, motor: jax.Array) -> Hinges:
-    """The line between speed and torque near another top speed; see `columns.motor_line`."""
+    """The line between speed and torque near another top speed; see `step_constants.motor_line`."""
     friction, gradient, top = hinges.motor
     limited = np.not_equal(gradient, 0) if not isinstance(gradient, jax.Array) else gradient != 0
     if not isinstance(limited, jax.Array) and not np.any(limited):

@@ -246,8 +246,8 @@ def wave_flow(
 
         u = a ω cosh(k s) / sinh(k h) cos θ along the wave, w = a ω sinh(k s) / sinh(k h) sin θ,
 
-    in deep water both with e^(kz) for the ratio. The velocity has a potential and no divergence.
-    Above the still surface the values at the still surface hold, below the bed those at the bed.
+    in deep water both with e^(kz) for the ratio. Below the still surface the velocity has a
+    potential and no divergence; above it the values at it hold, below the bed those at the bed.
     Valid while waves are low (k a ≪ 1; for long ones also a/h ≪ (k h)²): no drift of the mean, no
     sharper crests, no breaking, no change by the body (nothing is diffracted), and a bed that is
     level, whatever the world's is.
@@ -293,6 +293,7 @@ def _fading(world: World, wave: Wave, water: Water, z: Scalar) -> tuple[Scalar, 
 def wave_convection(world: World, water: Water, x: Scalar, y: Scalar, z: Scalar) -> Vec:
     """u·∇u of the waves' orbital velocity: what water accelerates by because it moves on.
 
+    Above the still surface it is the value at the still surface.
     Of second order in the waves' steepness, like the drift that it keeps away: without it a neutral
     body would sink while it goes round.
 

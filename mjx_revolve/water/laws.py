@@ -254,9 +254,9 @@ class Drag(NamedTuple):
     Attributes:
         force: [N].
         torque: [N·m].
-        damping: half of how fast the force along each axis falls with velocity [N·s/m], or of how
-            force and torque fall with both velocities: a step takes it implicitly where it must.
-            None for a law that a step takes explicitly.
+        damping: c |v| of a quadratic force c |v| v, half its gradient, along each axis [N·s/m];
+            of a linear force, all of its gradient, of force and torque by both velocities. A step
+            takes it implicitly where it must. None for a law that a step takes explicitly.
     """
 
     force: Vec

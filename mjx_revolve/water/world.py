@@ -245,7 +245,7 @@ def load_world(name: str | Path, **overrides: Any) -> World:
         below = fields.get(key)
         if key == "bed" and isinstance(below, int | float):
             below = {"height": below}
-        if isinstance(below, Mapping) and isinstance(value, Mapping):
+        if key != "waves" and isinstance(below, Mapping) and isinstance(value, Mapping):
             kind = below.get("kind", "flat")
             alike = value.get("kind", kind) == kind
             overrides[key] = {**below, **value} if alike else value

@@ -59,6 +59,20 @@ def test_a_crawler_gives_energy_to_the_bed():
     assert own.contact > 0.02 * own.work and own.residual < 0.05
 
 
+def test_what_water_takes_at_the_surface():
+    """A slam, and water that joins or leaves what a robot carries."""
+    robot, found = swing(read(ARM), -0.15, drag="faces")
+    assert balance(robot, found).residual < 0.015
+
+
+@pytest.mark.long
+def test_waves_that_a_robot_makes_are_drag():
+    robot, found = swing(read(OAR), 0.0, near_surface=True)
+    calm = build_robot(read(OAR), load_world("lake", bed=None))
+    own, other = balance(robot, found), balance(calm, found)
+    assert own.residual < 0.005 and own.potential == pytest.approx(other.potential, rel=1e-4)
+
+
 def test_thrusters():
     robot, found = swing(load_morphology("auv"), 2.0)
     own = balance(robot, found)

@@ -148,6 +148,10 @@ def test_where_they_may_stand():
     body = read(whole % "FixedBrick")
     robot = build_robot(body, world(**WATER))
     assert robot.fluid.drag == ("fossen", "off") and not robot.fluid.carries
+    # Nor does a brick that states a coupling of its own keep that.
+    own = np.diag([0.5] * 3 + [0.001] * 3) + 0.01 * np.eye(6)[::-1]
+    stated = f"FixedBrick, params: {{fossen: {{added_mass: {own.tolist()}}}}}"
+    assert not build_robot(read(whole % stated), world(**WATER)).fluid.coupling[1].any()
     assert set(build_robot(body, world(drag="ellipsoid")).fluid.drag) == {"ellipsoid"}
     with pytest.raises(InputError, match=r"expected no hinges, as the core's fossen\.whole"):
         read(whole % "ActiveHinge")

@@ -89,6 +89,10 @@ timestep: 2e-3
     assert load_world(path, shear={"depth": 2}).shear == dataclasses.replace(water.shear, depth=2)
     assert load_world(path, gust={"time": 2}).gust == Gust((0.05, 0.05, 0.0), time=2)
     assert load_world(path, waves=[{"amplitude": 0.1, "wavelength": 5}]).waves == (Wave(0.1, 5),)
+    one = tmp_path / "one.yaml"
+    one.write_text("waves: {amplitude: 0.02, wavelength: 2}\n")
+    wave = {"amplitude": 0.02, "period": 1}
+    assert load_world(one, waves=wave).waves == (Wave(0.02, period=1),)
     still = load_world(path, shear=None, gust="off", waves=False, surface_tension=None)
     assert (still.shear, still.gust, still.waves, still.surface_tension) == (None, None, (), None)
 
