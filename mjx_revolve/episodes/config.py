@@ -227,10 +227,10 @@ class TaskConfig(Section):
     """The body length: `stretched`: the longest way through the body with its hinges straightened
     (no fold makes that shorter); `rest`: the longest edge of its bounding box at rest."""
     duration: Annotated[Positive, Le(86_400), Unit("s")] = 10.0
-    """Length of an episode, a day at most [s]."""
+    """Length of an episode, a day at most, rounded to rows of the track, 0.1 s or so [s]."""
     settle: Annotated[NonNegative, Unit("s")] = 1.0
-    """Time at the start of an episode that does not count; scoring begins with the next sample, 0.1
-    s later at most [s]."""
+    """Time at the start of an episode that does not count; scoring begins with the next row, 0.1 s
+    later at most. The last two rows always count [s]."""
     trials: Annotated[Integer, Ge(1)] = 2
     """Episodes averaged per individual, each from its own start [-]."""
     direction: Annotated[Vector, Unit("-")] = (1.0, 0.0, 0.0)

@@ -36,7 +36,7 @@ from mjx_revolve.episodes.rollout import (
 )
 from mjx_revolve.episodes.scoring import extend_track, pick_near
 from mjx_revolve.episodes.starts import Starts, draw_starts, gust_rows
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, show
 
 _USUAL_RATE = 20.0  # control steps in a second, a choice: ten to a stroke of 2 Hz [Hz]
 
@@ -122,10 +122,8 @@ class Environment:
         rollout = self._rollout(starts, root[:3], still)
         body = start_at_rest(engine, root)
         now = rollout.init(body, self.observer.init(engine.joints(body)[0]))
-        row = lambda: task_recorder(engine, fitness.task, fitness.world)(  # noqa: E731
-            now, still, rollout.water_at(now.steps, now, self._inputs(starts, seed * 0))
-        )
-        episodes = fitness.init_episodes(now, starts, root[:3], row)
+        inputs = self._inputs(starts, seed * 0)
+        episodes = fitness.init_episodes(rollout, now, starts, root[:3], inputs)
         return EnvironmentState(episodes, seed, episode, jnp.zeros(seed.shape, bool))
 
     def _draw(self, seed: jax.Array, episode: jax.Array) -> Starts:
@@ -144,9 +142,8 @@ class Environment:
         return fitness.make_rollout(fitness.engine, held(ctrl), signals, starts, position, clock)
 
     def _inputs(self, starts: Starts, clock: Int[Array, " lanes"]) -> StepInputs:
-        """The water of a timestep; in gusts, of the last one after the end."""
-        last = jnp.minimum(clock, self.num_steps * self.every - 1)
-        rows = gust_rows(self.fitness.world, starts, 1, last)
+        """The water of a timestep; in gusts, that of the end after it."""
+        rows = gust_rows(self.fitness.world, starts, 1, clock)
         return StepInputs(jax.tree.map(lambda x: x[0], rows))
 
     def _at(
@@ -193,24 +190,24 @@ class Environment:
 
         Returns:
             The state, and the result. Episodes that were over are stepped, too.
+
+        Raises:
+            InputError: the robot has another number of actuators.
         """
         fitness, episodes, plant = self.fitness, state.episodes, self.fitness.engine.plant
+        if action.shape[0] != len(self.action_names):
+            raise InputError("action", f"{len(self.action_names)} numbers", action.shape[0])
         share = plant.arrange(jnp.clip(action, -1, 1))
         ctrl = plant.middle(share) + plant.reach(share) * share
         before, starts = episodes.rollout, episodes.starts
         rollout, now = self._at(episodes, ctrl, before.steps)
         inputs = StepInputs(gust_rows(fitness.world, starts, self.every, before.steps))
-        now = now._replace(controller_state=())
-        now, _ = rollout.advance(now, lambda *_: (), 1, self.every, inputs)
-        clock = before.steps + self.every
-        seen, energy = before.controller_state, before.energy + now.energy
-        now = now._replace(controller_state=seen, energy=energy, steps=clock)
-        episodes = episodes._replace(rollout=now)
-
-        rollout, present = self._at(episodes, ctrl, clock - 1)
-        water = rollout.water_at(present.steps, present, self._inputs(starts, clock - 1))
         recorder = task_recorder(rollout.engine, fitness.task, fitness.world)
-        row = {name: x[None] for name, x in recorder(present, ctrl, water).items()}
+        now = now._replace(controller_state=())
+        now, row = rollout.advance(now, recorder, 1, self.every, inputs)
+        row["energy"] += before.energy
+        clock, seen = before.steps + self.every, before.controller_state
+        now = now._replace(controller_state=seen, energy=row["energy"][0], steps=clock)
         track = extend_track(episodes.track, row, (clock - 1) // fitness.record_every)
         place = fitness.start_point(fitness.geometry, starts)
         score, sane = fitness.score_so_far(track, place, fitness.geometry, rollout.context, clock)
@@ -286,6 +283,8 @@ def make_environment(
         raise InputError(f"{config.source}: morphology", needed, "none")
     every = _period(control_rate, fitness.record_every, fitness.world.timestep)
     if sensors is not None:
+        if isinstance(sensors, str) or not isinstance(sensors, Sequence):
+            raise InputError("sensors", "a list", show(sensors))
         data = config.model_dump() | {"controller": {"type": "mlp", "sensors": list(sensors)}}
         config = make_config(data, "/", source=config.source)
     declared = with_sensors(config, fitness.robot.morphology).sensors

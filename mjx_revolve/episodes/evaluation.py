@@ -34,6 +34,7 @@ from mjx_revolve.episodes.rollout import (
     RolloutState,
     StepInputs,
     controlled,
+    no_commands,
     start_at_rest,
     with_variation,
 )
@@ -52,6 +53,7 @@ from mjx_revolve.episodes.starts import (
     draw_starts,
     episode_context,
     gust_rows,
+    gusty_water,
     start_pose,
     steady_water,
     target_path,
@@ -161,11 +163,31 @@ class EpisodeSpec(ABC, Generic[B]):
 
     def draw_starts(self, key: jax.Array) -> Starts:
         """The starts of a key's episodes, the same for all bodies."""
+        check_key(key)
         return draw_starts(self.settings, self.world, key, self.num_timesteps)
+
+    def draw_start(self, key: jax.Array, trial: int) -> Starts:
+        """The start of one of a key's episodes.
+
+        Raises:
+            InputError: the key has no such episode.
+        """
+        whole = isinstance(trial, int | np.integer) and not isinstance(trial, bool)
+        if not whole or not 0 <= trial < self.settings.trials:
+            known = f"a whole number from 0 to {self.settings.trials - 1}"
+            raise InputError("trial", known, repr(trial))
+        return jax.tree.map(lambda x: x[..., trial], self.draw_starts(key))
 
     def variation(self, key: jax.Array, trial: int = 0) -> Variation | None:
         """The coefficients of one of a key's episodes, as `simulate` takes them; None: as given."""
-        return jax.tree.map(lambda x: x[trial], self.draw_starts(key).variation)
+        return self.draw_start(key, trial).variation
+
+    def water(self, key: jax.Array, trial: int = 0) -> Water | None:
+        """The water of one of a key's episodes, as `simulate` takes it; None: the world's."""
+        start = self.draw_start(key, trial)
+        if start.gusts is None:
+            return start.water
+        return gusty_water(self.world, start.gusts, start.water)
 
     def precise_starts(self, population: jax.Array, key: jax.Array) -> Starts:
         """`draw_starts` in the population's precision."""
@@ -232,11 +254,18 @@ class EpisodeSpec(ABC, Generic[B]):
         return rollout, rollout.init(state, controller.init(parameters))
 
     def init_episodes(
-        self, now: RolloutState, starts: Starts, position: Float[Array, "3 lanes"], row: Any
+        self,
+        rollout: Rollout,
+        now: RolloutState,
+        starts: Starts,
+        position: Float[Array, "3 lanes"],
+        inputs: StepInputs,
     ) -> Episodes:
-        """Episodes before their first step; `row`: a function that returns a row of the track."""
-        shape = (self.num_records,)
-        track = {k: jnp.zeros(shape + x.shape, x.dtype) for k, x in jax.eval_shape(row).items()}
+        """Episodes before their first step, from its inputs and the state before it."""
+        recorder = task_recorder(rollout.engine, self.task, self.world)
+        still, shape = no_commands(rollout.engine, position), (self.num_records,)
+        row = jax.eval_shape(partial(rollout.record, recorder), now, still, inputs)
+        track = {name: jnp.zeros(shape + x.shape, x.dtype) for name, x in row.items()}
         return Episodes(widen(now), starts, position, track, jnp.zeros_like(position[0]))
 
     # ------------------------------------------------------------------ scores

@@ -52,8 +52,8 @@ from mjx_revolve.episodes.named_files import read_modules, read_morphology, read
 from mjx_revolve.episodes.rollout import RolloutState, with_variation
 from mjx_revolve.episodes.scoring import average_trials, list_episodes, max_distance, may_touch_bed
 from mjx_revolve.episodes.simulate import Trajectory, simulate
-from mjx_revolve.episodes.starts import Starts, episode_context, pick_water, target_path
-from mjx_revolve.episodes.tasks import TASKS, Task, find_task, start_at_depth
+from mjx_revolve.episodes.starts import Starts, episode_context, target_path
+from mjx_revolve.episodes.tasks import TASKS, Task, find_task, start_above_bed, start_at_depth
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.xla import materialize, over_chunks
 from mjx_revolve.water.bed import bed_height
@@ -218,14 +218,10 @@ class Fitness(EpisodeSpec[tuple[()]]):
 
         return jax.jit(run)
 
-    def water(self, key: jax.Array, trial: int = 0) -> Water | None:
-        """The water of one of a key's episodes, as `simulate` takes it; None: the world's."""
-        return pick_water(self.world, self.draw_starts(key), trial)
-
     def context(self, key: jax.Array, trial: int = 0) -> EpisodeContext:
         """The sensors' context in one of a key's episodes, as `simulate` takes it."""
-        starts = jax.tree.map(lambda x: x[..., trial], self.draw_starts(key))
-        return episode_context(self.settings, starts, self.starts(key)[0][:3, trial])
+        start = self.draw_start(key, trial)
+        return episode_context(self.settings, start, self.starts(key)[0][:3, trial])
 
     def starts(self, key: jax.Array) -> tuple[jax.Array, Water | None]:
         """Start poses and water of a key's episodes.
@@ -454,7 +450,7 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
     def water(self, key: jax.Array, trial: int = 0) -> Water | None:
         """The water of one of a key's episodes at a replay's rows; see `Fitness.water`."""
         every = self.trace_every
-        water = pick_water(self.world, self.draw_starts(key), trial)
+        water = super().water(key, trial)
         return jax.tree.map(lambda x: x[every - 1 :: every] if jnp.ndim(x) else x, water)
 
     def pack(self, robots: Sequence[Robot]) -> PackedBodies:
@@ -674,12 +670,16 @@ def _place(config: Config) -> tuple[World, Task]:
         place = f"{config.origin('task.start_attitude')}task.start_attitude"
         level = f"level, as {config.task.name} starts on the bed"
         raise InputError(place, level, config.task.start_attitude)
-    if world.bed is not None and task.start is start_at_depth and config.colony is None:
+    if world.bed is not None and config.colony is None:
         deepest = world.surface_height - float(bed_height(world.bed, *np.zeros((2, 1)))[0])
-        if config.task.depth >= deepest:
+        if task.start is start_at_depth and config.task.depth >= deepest:
             place = f"{config.origin('task.depth')}task.depth"
             least = f"one above the bed, which is {deepest:g} m below the surface"
             raise InputError(place, least, f"{config.task.depth:g}")
+        if task.start is start_above_bed and (config.task.height or 0) >= deepest:
+            place = f"{config.origin('task.height')}task.height"
+            most = f"one below the surface, which is {deepest:g} m above the bed"
+            raise InputError(place, most, f"{config.task.height:g}")
     _check_robust(config, world)
     return world, task
 

@@ -55,14 +55,16 @@ def make_env(config: Any, **settings: Any) -> Any:
     without a seed begins the seed's next episode.
 
     Raises:
-        InputError: there is a `num_envs` or an `autoreset_mode`; otherwise as `make_vector_env`.
+        InputError: there is a `num_envs` or an `autoreset_mode`, or a `render_mode` that is not
+            None; otherwise as `make_vector_env`.
     """
     from mjx_revolve.episodes.vector_env import make_vector_env
 
     for name in ("num_envs", "autoreset_mode"):
         if name in settings:
             raise InputError(name, "none, as this is a single Env", show(settings[name]))
-    settings.pop("render_mode", None)
+    if (mode := settings.pop("render_mode", None)) is not None:
+        raise InputError("render_mode", "none, as nothing is drawn", show(mode))
     return _make_class()(make_vector_env(config, 1, **settings))
 
 

@@ -109,6 +109,11 @@ def start_at_rest(engine: Engine, root: Float[Array, "7 lanes"]) -> PyTree:
     return engine.init(jnp.concatenate([root, hinges]), qvel)
 
 
+def no_commands(engine: Engine, like: Float[Array, "... lanes"]) -> Float[Array, "n lanes"]:
+    """Commands of 0, of the lanes and precision of `like`."""
+    return jnp.zeros((engine.plant.num_rows, like.shape[-1]), like.dtype)
+
+
 def with_variation(engine: Engine, variation: Variation | None) -> Engine:
     """An engine with the coefficients of an episode; the same one where they are not varied."""
     if variation is None:

@@ -29,7 +29,7 @@ from mjx_revolve.episodes.rollout import (
     open_loop,
     with_variation,
 )
-from mjx_revolve.episodes.starts import draw_gusts, gusty_water, noise_key, target_path
+from mjx_revolve.episodes.starts import check_key, draw_gusts, gusty_water, noise_key, target_path
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.short_repr import short_repr
 from mjx_revolve.numerics.xla import is_traced, jit
@@ -180,6 +180,8 @@ def simulate(
         InputError: a shape or a number is wrong.
     """
     model, dt = robot.mj_model, robot.world.timestep
+    if key is not None:
+        check_key(key)
     controller: Controller | None = None
     rows: Any = None
     if isinstance(ctrl, BoundController):
@@ -188,7 +190,7 @@ def simulate(
             raise InputError("genes", f"{controller.num_genes} numbers", drive_input.shape[0])
     elif ctrl is not None and not callable(ctrl):
         rows = _array("ctrl", ctrl, None)
-        if rows.ndim not in (1, 2) or rows.shape[-1] != model.nu:
+        if rows.ndim not in (1, 2) or rows.shape[-1] != model.nu or rows.shape[0] == 0 < model.nu:
             raise InputError("ctrl", f"[{model.nu}] or [T, {model.nu}]", list(rows.shape))
     steps = _steps(rows, duration, dt)
     if controller is None:
@@ -196,8 +198,10 @@ def simulate(
             rows = jnp.zeros(model.nu)
         elif callable(ctrl):
             rows = jax.vmap(lambda t: jnp.asarray(ctrl(t)))(dt * jnp.arange(steps))
-        if rows.shape[-1] != model.nu:
-            raise InputError("ctrl", f"{model.nu} targets", rows.shape[-1])
+            if rows.shape[1:] != (model.nu,):
+                found = rows.shape[-1] if rows.ndim == 2 else list(rows.shape[1:])
+                raise InputError("ctrl", f"{model.nu} targets", found)
+            rows = _array("ctrl", rows, None)
         drive_input = jnp.broadcast_to(rows, (steps, model.nu))
     if qpos is None:
         qpos = robot.start_qpos()

@@ -286,14 +286,6 @@ def gust_rows(
     return jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x, path.dtype), shape), water)
 
 
-def pick_water(world: World, starts: Starts, trial: int) -> Water | None:
-    """The water of one episode, as `simulate` takes it; None: the world's."""
-    water = jax.tree.map(lambda x: x[trial], starts.water)
-    if starts.gusts is None:
-        return water
-    return gusty_water(world, starts.gusts[..., trial], water)
-
-
 def _euler_quat(roll: jax.Array, pitch: jax.Array, yaw: jax.Array) -> jax.Array:
     """`[4, n]` quaternion (w, x, y, z) of roll, then pitch, then yaw [rad]."""
     (cr, sr), (cp, sp), (cy, sy) = ((jnp.cos(x / 2), jnp.sin(x / 2)) for x in (roll, pitch, yaw))

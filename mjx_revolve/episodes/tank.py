@@ -208,7 +208,8 @@ class Tank:
         else:
             wide = self.mixed.pad_genes(np.asarray(genes, np.float32), robot)
         size = np.linalg.norm(np.asarray(quat, float))
-        if not (np.all(np.isfinite(position)) and np.isfinite(size) and size > 0):
+        three = np.shape(position) == (3,) and np.all(np.isfinite(position))
+        if not (three and np.shape(quat) == (4,) and np.isfinite(size) and size > 0):
             finite = "a finite place and a quaternion of some length"
             raise InputError("tank", finite, f"{list(position)} and {list(quat)}")
         place = free[0]
@@ -297,7 +298,12 @@ class Tank:
 
         Returns:
             The robots' motion, rows at the end of each interval.
+
+        Raises:
+            InputError: a time is not above 0.
         """
+        if not all(0 < time < np.inf for time in (duration, every)):
+            raise InputError("tank", "times > 0 to advance by", f"{duration} and {every}")
         step = self.timestep
         stride = max(1, round(every / step))
         rows = max(1, round(duration / (stride * step)))

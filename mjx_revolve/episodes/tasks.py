@@ -20,7 +20,7 @@ import numpy as np
 from mjx_revolve.engine.plant import BodyGeometry, body_geometry
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.config import TaskConfig
-from mjx_revolve.episodes.measure_table import records_of
+from mjx_revolve.episodes.measure_table import MEASURES, records_of
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.user_code import (
     call_user_function,
@@ -174,6 +174,8 @@ class Task:
         for name in self.records:
             if name not in RECORDS:
                 raise InputError("records", f"any of {', '.join(RECORDS)}", repr(name))
+        if self.measure not in MEASURES:
+            raise InputError("measure", f"one of {', '.join(MEASURES)}", repr(self.measure))
 
 
 def _keeping(error: jax.Array, tolerance: float) -> jax.Array:

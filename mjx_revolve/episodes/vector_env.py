@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -163,17 +163,18 @@ def _make_class() -> type:
 
         def _read_seeds(self, seed: int | Sequence[int | None]) -> np.ndarray:
             """`[num_envs]` seeds, -1 for None."""
-            found, size = np.asarray(seed), self.num_envs
-            whole = np.issubdtype(found.dtype, np.integer) and found.shape in ((), (size,))
-            if found.dtype == object and found.shape == (size,):
-                known = self._read_seeds([0 if x is None else x for x in found])
-                return np.where([x is None for x in found], -1, known)
-            if not whole or not np.all((found >= 0) & (found < 2**32)):
+
+            def fits(x: Any) -> bool:
+                whole = isinstance(x, int | np.integer) and not isinstance(x, bool)
+                return x is None or (whole and 0 <= x < 2**32)
+
+            several = isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str)
+            each: list[Any] = list(cast(Any, seed)) if several else [seed]
+            if not all(map(fits, each)) or len(each) != (self.num_envs if several else 1):
                 wanted = f"a whole number from 0 to {2**32 - 1}, or {self.num_envs} of them"
                 raise InputError("seed", wanted, repr(seed))
-            if found.shape == ():
-                found = (int(found) + np.arange(size, dtype=np.int64)) % 2**32
-            return found.astype(np.int64)
+            found = np.array([-1 if x is None else int(x) for x in each])
+            return found if several else (found + np.arange(self.num_envs)) % 2**32
 
         def _read_mask(self, options: Mapping[str, object] | None) -> np.ndarray | None:
             if not options or "reset_mask" not in options:
@@ -208,7 +209,7 @@ def _make_class() -> type:
             if given.shape != shape:
                 raise InputError("actions", list(shape), list(given.shape))
             self._state, seen, outcome, last = self._step(self._state, given)
-            self._seen = np.array(seen)
+            self._seen = np.array(seen, np.float32)
             terminated, truncated = np.array(outcome.terminated), np.array(outcome.truncated)
             infos: dict[str, object] = {}
             over = terminated | truncated
@@ -216,7 +217,7 @@ def _make_class() -> type:
                 score = np.where(over, np.asarray(outcome.score), 0.0)
                 infos = {"score": score, "_score": over.copy()}
                 if self.autoreset_mode == AutoresetMode.SAME_STEP:
-                    final = np.where(over[:, None], np.asarray(last), np.float32(0))
+                    final = np.where(over[:, None], np.asarray(last, np.float32), np.float32(0))
                     infos = {"final_obs": final, "_final_obs": over.copy(),
                              "final_info": infos, "_final_info": over.copy()}  # fmt: skip
             rewards = np.asarray(outcome.reward).astype(np.float64)

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from mjx_revolve.control.readings import EpisodeContext
 from mjx_revolve.episodes.evaluation import Episodes, narrow, task_recorder, widen
 from mjx_revolve.episodes.fitness import Fitness
-from mjx_revolve.episodes.rollout import Rollout, StepInputs, controlled
+from mjx_revolve.episodes.rollout import Rollout, StepInputs, controlled, no_commands
 from mjx_revolve.episodes.scoring import extend_track, list_episodes, pick_near
 from mjx_revolve.episodes.starts import Starts, check_key, gust_rows
 from mjx_revolve.episodes.tape import advance_taped, float_leaves, wide_leaves
@@ -141,18 +141,12 @@ class TruncatedBPTT:
         root = fitness.start_pose(fitness.geometry, starts)
         rollout, now = fitness.start_rollout(fitness.engine, genes, starts, root)
         inputs = jax.tree.map(lambda x: x[0, 0], self._inputs(starts, now.steps))
-        recorder = task_recorder(rollout.engine, fitness.task, fitness.world)
-        row = partial(rollout.record, recorder, now, self._still(genes), inputs)
-        return fitness.init_episodes(now, starts, root[:3], row)
+        return fitness.init_episodes(rollout, now, starts, root[:3], inputs)
 
     def _rollout(self, starts: Starts, position: jax.Array, parameters: PyTree) -> Rollout:
         controller, engine = self.fitness.controller, self.fitness.engine
         policy = controlled(controller, parameters)
         return self.fitness.make_rollout(engine, policy, controller.signals, starts, position)
-
-    def _still(self, genes: jax.Array) -> Float[Array, "n lanes"]:
-        """No commands."""
-        return jnp.zeros((self.fitness.engine.plant.num_rows, genes.shape[-1]), genes.dtype)
 
     def _inputs(self, starts: Starts, clock: jax.Array) -> StepInputs:
         """Inputs `[records, every, lanes]` of the steps of a window."""
@@ -172,7 +166,8 @@ class TruncatedBPTT:
         begin = partial(fitness.start_rollout, fitness.engine, genes, starts)
         now = narrow(episodes.rollout, jax.eval_shape(lambda root: begin(root)[1], root))
         recorder = task_recorder(rollout.engine, fitness.task, fitness.world)
-        given = parameters, now, self._still(genes), self._inputs(starts, now.steps)
+        still = no_commands(fitness.engine, genes)
+        given = parameters, now, still, self._inputs(starts, now.steps)
         then, rows, pull = advance_taped(make, recorder, *given, records=self.records, every=every)
         score, by_rows, track = self._judge(rows, episodes, rollout.context, now.steps)
         by_now, by_parameters = pull(by_rows)

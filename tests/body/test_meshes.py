@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from operator import setitem
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from experiments.meshes import check_mesh, load_mesh, mesh_center_of_volume, mes
 from laboratory import check_refused, refusal
 from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.solids import part_mesh
-from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.trust import audited_by
 
 TETRAHEDRON = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], float)
@@ -145,51 +143,18 @@ def _exported(mesh: trimesh.Trimesh, kind: str) -> bytes:
     return data if isinstance(data, bytes) else data.encode()
 
 
-def _folder(tmp_path: Path) -> Path:
-    """A folder `robot/` with good and bad files, beside a file outside of it."""
-    folder = tmp_path / "robot"
-    (folder / "parts").mkdir(parents=True)
-    good = _exported(box(), "stl")
-    for place in (folder / "good.stl", folder / "parts" / "good.stl", tmp_path / "secret.stl"):
-        place.write_bytes(good)
-    (folder / "link.stl").symlink_to(tmp_path / "secret.stl")
-    (folder / "in.stl").symlink_to("parts/good.stl")
-    (folder / "text.obj").write_text("v 1 2\nf a b c\n")
-    (folder / "open.stl").write_bytes(
-        _exported(trimesh.Trimesh(box().vertices, box().faces[2:], process=False), "stl")
-    )
-    (folder / "part.dae").write_text("<COLLADA/>")
-    return folder
-
-
-def test_paths_inside_the_folder_are_read(tmp_path):
-    folder = _folder(tmp_path)
-    for path in ("good.stl", "parts/good.stl", "./good.stl", "in.stl"):
-        assert mesh_volume(load_mesh(path, folder=folder)) == pytest.approx(24.0)
-
-
 @pytest.mark.parametrize(
     ("path", "message"),
     [
-("../secret.stl", "../secret.stl: expected a path inside {folder}; found one that leads "
-         "out"),
-("link.stl", "link.stl: expected a path inside {folder}; found a link that leads out"),
-("missing.stl", "missing.stl: expected a file; found none"),
-("part.dae", "part.dae: expected one of .stl, .obj, .ply; found '.dae'"),
-("text.obj", "text.obj: expected "),  # NumPy 2.0 lets trimesh read it, as no triangles
-("open.stl", "open.stl: expected a closed surface; found 4 open edges of 17")
-],
-)  # fmt: skip
+        ("../part.stl", "expected a path inside {folder}; found one that leads out"),
+        ("missing.stl", "expected a file; found none"),
+        ("part.dae", "expected one of .stl, .obj, .ply; found '.dae'"),
+    ],
+)
 def test_bad_files_are_refused(tmp_path, path, message):
-    folder = _folder(tmp_path)
-    check_refused("", load_mesh, path, folder=folder, start=message.format(folder=folder))
-
-
-def test_a_large_file_is_refused(tmp_path):
-    with (tmp_path / "large.stl").open("wb") as file:
-        file.truncate(65 * 2**20)
-    with pytest.raises(InputError, match="expected at most 64 MiB; found more"):
-        load_mesh(tmp_path / "large.stl")
+    expected = f"{path}: {message.format(folder=tmp_path)}"
+    (tmp_path / "part.dae").write_text("<COLLADA/>")
+    check_refused("", load_mesh, path, folder=tmp_path, start=expected)
 
 
 @pytest.mark.parametrize(("kind", "part"), PARTS, ids=PART_NAMES)

@@ -83,4 +83,9 @@ def test_one_body_and_many_and_its_replay(settings):
     score, _ = one.judge(swum, KEY)
     assert swum.variation == one.variation(KEY) != Variation()
     assert mixed.replay(robots[:1], genes[:1], KEY, 1)[0].variation == mixed.variation(KEY, 1)
+    for wrong in (-1, 2, True):
+        with pytest.raises(InputError, match="trial: expected a whole number from 0 to 1"):
+            mixed.variation(KEY, wrong)
+    with pytest.raises(InputError, match=r"key: expected jax\.random\.key"):
+        one.replay(np.zeros(one.num_genes), 0)
     assert score == pytest.approx(float(one(genes[:1], KEY)[0]), rel=1e-3)

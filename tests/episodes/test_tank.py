@@ -171,6 +171,12 @@ def test_what_cannot_be_is_refused(tank, mixed, robots):
         water.add(robots[0], None, (0, 0, -1), world=-1)
     with pytest.raises(InputError, match="current: expected three numbers"):
         water.set_current((0, 1))
+    for place, quat in (((0, 0), (1, 0, 0, 0)), ((0, 0, -1), (1, 0, 0))):
+        with pytest.raises(InputError, match="finite place and a quaternion of some length"):
+            water.add(robots[0], None, place, quat)
+    for times in ((-1, 0.1), (np.nan, 0.1), (1, 0)):
+        with pytest.raises(InputError, match="expected times > 0 to advance by"):
+            water.advance(*times)
     assert water.count == 0
     empty = water.advance(1.0, 0.5)
     assert empty.time.tolist() == [0.5, 1.0] and not empty.alive.any()

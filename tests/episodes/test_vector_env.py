@@ -10,6 +10,7 @@ import pytest
 from laboratory import OAR, check_refused, swimmer
 from mjx_revolve import InputError, make_fitness, make_vector_env, simulate
 from mjx_revolve.engine.plant import actuators_of
+from mjx_revolve.episodes.functional_env import make_functional_env
 from mjx_revolve.episodes.gym_ids import make_env
 from mjx_revolve.episodes.scoring import WORST
 
@@ -273,8 +274,15 @@ def test_wrong_calls_get_one_message(config):
         env.step(np.zeros((2, 1)))
     with pytest.raises(InputError, match="autoreset_mode: expected none, as this is a single Env"):
         make_env(config, autoreset_mode="SameStep")
-    for seed in (-1, 2**32, 0.5, [1, 2, 3], [None], ["a", None], "a"):
+    for seed in (-1, 2**32, 0.5, [1, 2, 3], [None], ["a", None], "a", [2**64, 1], [[1], [2, 3]]):
         with pytest.raises(InputError, match="seed: expected a whole number"):
             env.reset(seed=seed)
+    with pytest.raises(InputError, match="render_mode: expected none, as nothing is drawn"):
+        make_env(config, render_mode="rgb_array")
+    with pytest.raises(InputError, match="sensors: expected a list; found 5"):
+        make_vector_env(config, 2, sensors=5)
+    pure = make_functional_env(config)
+    with pytest.raises(InputError, match=r"action: expected 1 numbers; found 3"):
+        jax.eval_shape(lambda key: pure.step(pure.reset(key), np.zeros(3)), jax.random.key(0))
     with pytest.raises(InputError, match=r"reset_mask: expected \[2\] of bool"):
         env.reset(seed=0, options={"reset_mask": [True]})
