@@ -146,6 +146,7 @@ def make_page() -> str:
     lines += ["| task | score | unit | cannot do without |", "|---|---|---|---|"]
     for name, task in TASKS.items():
         needs = [f"`{x}`" for x in settings.TASKS[name]] + ["a world with a bed"] * task.on_bed
+        needs += ["`target` or `target_distance`"] * (name in settings.TO_TARGETS)
         said = re.sub(r" \[[^\]]+\].$", "", first_paragraph(task.score))
         lines.append(f"| `{name}` | {said} | {task.unit} | {', '.join(needs)} |")
     lines += ["", *_FAILED.split("\n")]

@@ -122,7 +122,7 @@ SENSORS: Mapping[str, SensorKind] = {
     ),
     "nearest_tag": _number("nearest.tag", "-", (-1, 1),
                            "number that identifies the nearest other robot", **_NEAREST),
-    "course": _vector("course", "-", 1, "the direction to keep to, core frame"),
+    "course": _vector("course", "-", 1, "the direction to keep to, core frame", sits=False),
     "battery": _number(
         "work", "J", (0, 100), "work that servos and propellers have done so far",
         signals="work", sits=False,

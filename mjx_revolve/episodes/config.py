@@ -86,7 +86,7 @@ OLDER: dict[str, dict[str, Any]] = {
 OLDER_WORLD = {"drag": "faces", "self_contact": False}
 """Values of worlds in run folders that do not state them; newer folders do (`state_world`)."""
 # Tasks with a target.
-_TO_TARGETS = ("reach_target", "search", "escape")
+TO_TARGETS = ("reach_target", "search", "escape")
 # Tasks that count less away from a depth, and those that look along `direction`.
 _AT_DEPTH = ("directed_swim", "speed", "follow_course", "escape", "follow_bed", "crawl")
 _DIRECTED = ("directed_swim", "hold_heading", "follow_bed", "crawl")
@@ -319,7 +319,7 @@ class TaskConfig(Section):
         found = [name for name in ("target", "target_distance") if getattr(self, name) is not None]
         if len(found) > 1:
             raise ConstraintError("target", "none, as there is a target_distance", "one")
-        if not found and self.type in _TO_TARGETS:
+        if not found and self.type in TO_TARGETS:
             what = f"three numbers [m], or target_distance, because task.type is {self.type}"
             raise ConstraintError("target", what, "none")
         if self.target_turn is not None and self.target_speed == 0:

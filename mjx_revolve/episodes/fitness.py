@@ -448,7 +448,7 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
         return self.keep(run, "trace")
 
     def water(self, key: jax.Array, trial: int = 0) -> Water | None:
-        """The water of one of a key's episodes at a replay's rows; see `Fitness.water`."""
+        """The water of one of a key's episodes at a replay's rows; None: the world's."""
         every = self.trace_every
         water = super().water(key, trial)
         return jax.tree.map(lambda x: x[every - 1 :: every] if jnp.ndim(x) else x, water)

@@ -574,6 +574,9 @@ def _check_motion(signals: Mapping[str, TimeSeries], robot: Robot) -> None:
                 "world.surface_height=HEIGHT)?"
             )
     still = "mean_speed" not in signals
+    places = [len(s.time) for n, s in signals.items() if n in _PLACE or n.startswith("mark.")]
+    if still and places and max(places) < 3:
+        raise InputError(f"expected three frames or more; found {max(places)}")
     for name, signal in signals.items():
         if not (name in _PLACE or name.startswith("mark.")) or len(signal.time) < 3:
             continue

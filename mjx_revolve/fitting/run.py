@@ -83,7 +83,10 @@ def read_settings(texts: Sequence[str]) -> tuple[FitSettings, dict[str, Any], bo
     trim = given.get("trim", "none")
     if trim not in ("neutral", "none"):
         raise InputError("--set trim", "neutral or none", show(trim))
-    return read(FitSettings, own, "settings"), world, trim == "neutral"
+    try:
+        return read(FitSettings, own), world, trim == "neutral"
+    except InputError as error:
+        raise InputError(f"--set {error}") from None
 
 
 def load_robot(

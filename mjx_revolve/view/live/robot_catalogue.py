@@ -25,7 +25,7 @@ from mjx_revolve.inputs.shipped import find_shipped, list_shipped
 from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.view.live.simulation import CatalogueEntry
 from mjx_revolve.view.population import rank
-from mjx_revolve.water.world import World
+from mjx_revolve.water.world import World, load_world
 
 # The configuration with the default water and controller.
 _USUAL = "lake_swim"
@@ -101,6 +101,8 @@ def load_catalogue(paths: Sequence[str], world: str | None = None) -> RobotCatal
     changes: dict[str, Any] = {
         "engine": "population", "task.duration": _WHILE, "task.horizon": None
     }  # fmt: skip
+    if world is not None:
+        load_world(world)  # what is wrong of it is said of the option
     config = override_config(config, changes | ({} if world is None else {"world": world}))
     water = read_world(config)
     drafts: list[_Draft] = []
