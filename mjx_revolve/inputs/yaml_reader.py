@@ -5,8 +5,10 @@ What is written is read back as it was.
 
 from __future__ import annotations
 
+import copy
 import re
 from collections.abc import Hashable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -151,8 +153,7 @@ def parse_yaml(content: bytes, path: str | Path) -> Any:
     with reading(path):
         text = content.decode("utf-8")
         try:
-            data = yaml.load(text, Loader=SafeLoader)
-            check_size(data)
+            return copy.deepcopy(_parse(text))
         except RecursionError:
             raise _too_deep() from None
         except yaml.YAMLError as error:
@@ -160,6 +161,13 @@ def parse_yaml(content: bytes, path: str | Path) -> Any:
             place = f"line {mark.line + 1}: " if mark else ""
             problem = getattr(error, "problem", None) or str(error).splitlines()[0]
             raise InputError(f"{place}expected valid YAML; found: {problem}") from None
+
+
+@lru_cache(maxsize=16)
+def _parse(text: str) -> Any:
+    """Kept, as a command reads a world eight times and PyYAML takes longer than all else of it."""
+    data = yaml.load(text, Loader=SafeLoader)
+    check_size(data)
     return data
 
 

@@ -304,6 +304,7 @@ def host_key() -> tuple[str, ...]:
     return source_hash(), str(_versions()), _cpu_hash(), cores
 
 
+@functools.cache
 def _versions() -> dict[str, str]:
     """Versions of Python and of the packages that affect the bits of results."""
     versions = {"python": platform.python_version()}
@@ -322,7 +323,7 @@ def describe_process() -> dict[str, object]:
     import jax
 
     return {
-        "versions": _versions(),
+        "versions": dict(_versions()),
         "git": _git_revision(),
         "argv": sys.argv,
         "platform": platform.platform(),
