@@ -82,13 +82,16 @@ def as_numbers(found: Interval) -> dict[str, Any]:
     return {"mean": finite[0], "half": finite[1], "size": found.size, "text": str(found)}
 
 
-def read_rows(name: str, rows: str, folder: Path = RESULTS) -> list[dict[str, Any]]:
+def read_rows(
+    name: str, rows: str, folder: Path = RESULTS, any_machine: bool = False
+) -> list[dict[str, Any]]:
     """Rows that `write_results` wrote before, for what adds to them.
 
     Args:
         name: of the study.
         rows: their key in its numbers.
         folder: where its file is.
+        any_machine: whether rows may be of another machine than this one.
 
     Returns:
         The rows; none where there is no file.
@@ -100,7 +103,7 @@ def read_rows(name: str, rows: str, folder: Path = RESULTS) -> list[dict[str, An
     if not path.exists():
         return []
     known = json.loads(path.read_text("utf-8"))
-    if (here := _machine()) != known["machine"]:
+    if not any_machine and (here := _machine()) != known["machine"]:
         raise InputError(str(path), f"rows of this machine, {here}", f"those of {known['machine']}")
     return known["numbers"][rows]
 

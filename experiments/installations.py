@@ -170,7 +170,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"Wrote {path}")
     if args.results:
         # Columns that were not tried stay as they were found.
-        columns = {row["name"]: row for row in read_rows("installations", "columns")}
+        columns = {
+            row["name"]: row for row in read_rows("installations", "columns", any_machine=True)
+        }
         for name, one in found.items():
             title = f"{name}-{_PYTHON}"
             columns[title] = {"name": title, **one, "found": describe(name, one)}

@@ -610,6 +610,7 @@ def main(argv: list[str] | None = None) -> int:
     if options.quick:
         cases = [replace(case, mjx=False) for case in cases if case.robot == "spider"][:2]
     place = RESULTS if options.results else make_folder(options.out, "precision")
+    read_rows("precision", "rows", place)  # refuses those of another machine before anything runs
     for case in cases:
         began = time.monotonic()
         found = run_case(case, sizes)

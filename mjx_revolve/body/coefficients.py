@@ -67,7 +67,8 @@ def correct_types(
 
     def correct(kind: ModuleType) -> ModuleType:
         for name in (ALL, kind.name, *kind.aliases):
-            kind = apply_overrides(kind, _suited(entries.get(name, {}), kind))
+            with reading(f"{source}: modules.{name}"):
+                kind = apply_overrides(kind, _suited(entries.get(name, {}), kind))
         return kind
 
     return {name: correct(kind) for name, kind in modules.items()}
@@ -108,7 +109,8 @@ def _correct(module: Module, entries: Entries, source: str) -> Module:
     if params == module.params:
         return module
     # Of the type and all params at once, as the saved robot is read.
-    return replace(module, kind=apply_overrides(kind, params), params=params, base=kind)
+    with reading(f"{source}: modules.{module.name}"):
+        return replace(module, kind=apply_overrides(kind, params), params=params, base=kind)
 
 
 def merge_params(params: Mapping[str, Any], entry: Mapping[str, Any]) -> dict[str, Any]:
@@ -121,6 +123,8 @@ def merge_params(params: Mapping[str, Any], entry: Mapping[str, Any]) -> dict[st
         old, new = params.get(key, {}), entry.get(key, {})
         if old and new and new.get("curve", old.get("curve")) == old.get("curve"):
             found[key] = old | new
+    if "coefficients" in found:
+        found["coefficients"] = {**params.get("coefficients", {}), **found["coefficients"]}
     before, more = params.get("factors", {}), entry.get("factors", {})
     if before or more:
         both = {k: multiply_factors(x, before.get(k, 1.0)) for k, x in more.items()}

@@ -407,14 +407,14 @@ def trim_neutral(morphology: Morphology, density: float) -> Morphology:
     """
     density = read(Annotated[Positive, Unit("kg/m3")], density, "density")
     core = morphology.modules[0]
-    if core.kind.parts[0].buoyancy == "off":
+    if max(core.kind.parts, key=lambda part: part.volume).buoyancy == "off":  # has the electronics
         raise InputError(
             f"{morphology.path or morphology.name}: expected a core that the water lifts, to be "
             "trimmed by its volume; found buoyancy off"
         )
     parts = [part for module in morphology.modules for part in module.kind.parts]
     dead = sum(part.total_volume - part.lifted_volume for part in parts)
-    inside = sum(part.electronics_volume for part in core.kind.parts)
+    inside = sum(p.electronics_volume for p in core.kind.parts if p.buoyancy != "off")
     total = morphology.mass / density - (morphology.volume - dead - inside)
     if total < -1e-9 * morphology.volume:  # neutral to rounding counts as neutral
         raise InputError(

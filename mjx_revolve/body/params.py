@@ -73,7 +73,7 @@ _PLAIN: dict[str, object] = {
     "drag_coefficient": Annotated[PerAxis, _Loose, Unit("-")],
     "added_mass_coefficient": Annotated[PerAxis, _Loose, Unit("-")],
     "entrained_water": Annotated[Share, _Loose],
-    "coefficients": Coefficients,
+    "coefficients": Annotated[Coefficients, AfterValidator(dict)],
     "buoyancy": BuoyancyName,
     "drag": PartDrag,
     "added_mass": Boolean,
@@ -150,6 +150,9 @@ def apply_overrides(kind: ModuleType, params: Mapping[str, Any]) -> ModuleType:
         return kind
     parts = kind.parts
     changes = [{key: params[key] for key in _PLAIN if key in params} for _ in parts]
+    if "coefficients" in params:
+        for part, change in zip(parts, changes, strict=True):
+            change["coefficients"] = dict(part.coefficients) | params["coefficients"]
     for key in ("mass", "volume"):
         if key in params:
             shares = _share([getattr(part, key) for part in parts], params[key])

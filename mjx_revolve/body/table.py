@@ -76,8 +76,9 @@ def summary(morphology: Morphology, density: float, gravity: float) -> list[str]
         gravity: [m/s²].
     """
     mass, volume = morphology.mass, morphology.volume
-    weight, buoyancy = mass * gravity, density * volume * gravity
-    relative = mass / (density * volume) if volume > 0.0 else math.inf
+    lifted = sum(part.lifted_volume for m in morphology.modules for part in m.kind.parts)
+    weight, buoyancy = mass * gravity, density * lifted * gravity
+    relative = mass / (density * lifted) if lifted > 0.0 else math.inf
     net = weight - buoyancy
     verdict = "sinks" if net > 0 else "floats"
     verdict = "neutral" if abs(net) <= 1e-9 * weight else verdict

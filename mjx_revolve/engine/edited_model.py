@@ -19,8 +19,11 @@ _FIXED = (
     *("body_parentid", "body_pos", "body_quat", "body_jntadr", "jnt_pos", "jnt_axis"),
     # Forces that our step does not have.
     *("jnt_stiffness", "dof_frictionloss", "actuator_gear", "qpos_spring", "body_gravcomp"),
+    *("jnt_actfrclimited", "jnt_actfrcrange", "actuator_dyntype", "actuator_gaintype"),
+    # What our step takes from the robot.
+    *("qpos0", "actuator_trnid", "actuator_biastype"),
 )
-_COUNTS = ("nbody", "nq", "nv", "nu")
+_COUNTS = ("nbody", "nq", "nv", "nu", "neq", "ntendon")
 
 
 def check_edit(model: mujoco.MjModel, built: mujoco.MjModel, name: str) -> None:
@@ -38,7 +41,11 @@ def check_edit(model: mujoco.MjModel, built: mujoco.MjModel, name: str) -> None:
     if not changed:
         pairs = [(x, getattr(model, x), getattr(built, x)) for x in _FIXED]
         pairs += [(f"opt.{x}", *(getattr(m.opt, x) for m in (model, built)))
-                  for x in ("timestep", "gravity")]  # fmt: skip
+                  for x in ("timestep", "gravity", "disableflags")]  # fmt: skip
+        pairs += [(f"{x} of the core", getattr(model, x)[:6], getattr(built, x)[:6])
+                  for x in ("dof_armature", "dof_damping")]  # fmt: skip
+        pairs += [(x, getattr(model, x)[:, part], getattr(built, x)[:, part]) for x, part in
+                  (("actuator_biasprm", 0), ("actuator_gainprm", slice(1, None)))]  # fmt: skip
         changed = [x for x, new, old in pairs if not np.allclose(new, old, atol=1e-9)]
     if changed:
         expected = "other masses, inertias, hinges or servos only"

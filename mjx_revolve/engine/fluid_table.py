@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from mjx_revolve.body.exposure import exposure
 from mjx_revolve.body.module_types import Part
 from mjx_revolve.body.placement import RestPose
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.short_repr import short_repr
 from mjx_revolve.water.added_mass import box_added_mass, entrained_water
 from mjx_revolve.water.buoyancy import find_buoyancy_law
@@ -116,14 +117,22 @@ def drag_law(part: Part, world: World) -> str:
     if world.drag in ("off", INERTIA_BOX.name):
         return world.drag
     if part.drag is not None or world.drag == ELLIPSOID.name:
-        return part.drag or world.drag
+        return _check_wake(part.drag or world.drag, part, world)
     if part.fossen is not None:
         return "fossen"
     crossed = world.drag == CROSS_FLOW.name
     if part.lift_drag is not None:
         lags = crossed and not part.lift_drag.radial_symmetry
         return FIN_WAKE.name if lags else LIFT_DRAG.name
-    return PLATE_WAKE.name if crossed and thinness(part.boxes[0].size) > 0 else world.drag
+    thin = crossed and thinness(part.boxes[0].size) > 0
+    return PLATE_WAKE.name if thin else _check_wake(world.drag, part, world)
+
+
+def _check_wake(name: str, part: Part, world: World) -> str:
+    """The name of a drag law that the part's plate can have."""
+    if name == FIN_WAKE.name and (part.lift_drag or world.lift_drag).radial_symmetry:
+        raise InputError("lift_drag.radial_symmetry", f"false with drag: {name}", "true")
+    return name
 
 
 def _scaled(parameters: Any, part: Part) -> Any:

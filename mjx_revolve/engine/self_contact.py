@@ -376,7 +376,8 @@ def _find_contacts(
         given = take_lanes(real, one.lane) & (one.shell != other.shell) & (number < npair * size)
         square = dot(away, away)
         near = given & (square < (reach + take_lanes(drift, one.lane)) ** 2)
-        apart = jnp.where(given & ~near, jnp.sqrt(square) - reach, _FAR)
+        # Of a pair that stands for none the root has a gradient, too, and it must be finite.
+        apart = jnp.where(given & ~near, jnp.sqrt(jnp.maximum(square, 1e-30)) - reach, _FAR)
         for k in range(0, width, size):
             clear = jnp.minimum(clear, apart[k : k + size])
         return block + 1, append_true(near, number, listed, steady), clear

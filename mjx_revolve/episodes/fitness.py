@@ -676,10 +676,11 @@ def _place(config: Config) -> tuple[World, Task]:
             place = f"{config.origin('task.depth')}task.depth"
             least = f"one above the bed, which is {deepest:g} m below the surface"
             raise InputError(place, least, f"{config.task.depth:g}")
-        if task.start is start_above_bed and (config.task.height or 0) >= deepest:
+        height = config.task.height
+        if task.start is start_above_bed and height is not None and height >= deepest:
             place = f"{config.origin('task.height')}task.height"
             most = f"one below the surface, which is {deepest:g} m above the bed"
-            raise InputError(place, most, f"{config.task.height:g}")
+            raise InputError(place, most, f"{height:g}")
     _check_robust(config, world)
     return world, task
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -168,8 +168,9 @@ def _make_class() -> type:
                 whole = isinstance(x, int | np.integer) and not isinstance(x, bool)
                 return x is None or (whole and 0 <= x < 2**32)
 
-            several = isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str)
-            each: list[Any] = list(cast(Any, seed)) if several else [seed]
+            given: Any = np.asarray(seed).tolist() if hasattr(seed, "dtype") else seed
+            several = isinstance(given, Sequence) and not isinstance(given, str | bytes)
+            each = list(given) if several else [given]
             if not all(map(fits, each)) or len(each) != (self.num_envs if several else 1):
                 wanted = f"a whole number from 0 to {2**32 - 1}, or {self.num_envs} of them"
                 raise InputError("seed", wanted, repr(seed))

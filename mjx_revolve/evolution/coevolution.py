@@ -65,6 +65,7 @@ class BodySearch:
         trials: brains that were tried.
         seconds: time spent in generations [s]; not reproducible.
         offspring: the last generation's individuals; not saved.
+        parents: its parents, with their new scores, where they are evaluated again; not saved.
     """
 
     generation: int = 0
@@ -78,6 +79,7 @@ class BodySearch:
     trials: int = 0
     seconds: float = 0.0
     offspring: tuple[Individual, ...] = ()
+    parents: tuple[Individual, ...] = ()
 
 
 class _Proposal(NamedTuple):
@@ -216,6 +218,7 @@ class BodyEvolution(IndividualEvolution, Evolution[BodySearch, _Proposal, list[I
             next_number=search.next_number + len(born),
             trials=search.trials + trials,
             offspring=tuple(born),
+            parents=tuple(together[:old]) if self.selection.reevaluate else (),
         )
         scores = np.array([individual.score for individual in born])
         champion = found.elites[0].score if found.elites else float("-inf")
@@ -283,11 +286,10 @@ class BodyEvolution(IndividualEvolution, Evolution[BodySearch, _Proposal, list[I
     def logs(self, search: BodySearch) -> Mapping[str, Sequence[str]]:
         """The last generation's individuals, and the numbers of the living.
 
-        Where parents are evaluated again, those that stay have a line with their new scores, too.
+        Parents that were evaluated again have a line with their new scores, too; those that leave
+        may still be among the best.
         """
-        logged = list(search.offspring)
-        if self.selection.reevaluate:
-            logged += [one for one in search.living if one.born < search.generation]
+        logged = (*search.offspring, *search.parents)
         lines = [to_text(one, self.fitness.genotype) for one in logged]
         return {INDIVIDUALS: lines, GENERATIONS: [living_line(search)]}
 

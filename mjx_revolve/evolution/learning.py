@@ -88,6 +88,8 @@ class _Learner:
         self.tried = np.where(np.isfinite(tried), tried, self.birth).astype(np.float32)
         if turn == 0:
             self.tried = np.concatenate([self.birth[None], self.tried[1:]])
+            if isinstance(strategy, Strategy):
+                self.state = strategy.with_mean_first(self.state)
 
     def tell(self, strategy: Strategy | Perturbation, scored: Scored, turn: int) -> None:
         """Takes in the scores of the brains that were tried."""

@@ -17,6 +17,8 @@ _COPIES, _MORE = 8, 100
 _PAIRS = {"DifferentialEvolution": 24}
 # Bytes of a small body with its genome; measured, rounded down.
 _BODY = 2_000
+# The smallest population of bodies that a user may ask for.
+_FEWEST = 4
 
 
 def check_memory(config: Config, num_genes: int) -> None:
@@ -37,7 +39,11 @@ def check_memory(config: Config, num_genes: int) -> None:
     if bodies is None:
         pair = _PAIRS.get(find_strategy(evolution.strategy), 0)
     else:
-        one = _BODY + one * bodies.learning.population_size
+        learners, place = bodies.learning.population_size, "bodies.learning.population_size"
+        if free is not None and _FEWEST * (_BODY + one * learners) > free:
+            most = max(0, int((free / _FEWEST - _BODY) / one))
+            raise _too_large(config, place, most, free, learners)
+        one = _BODY + one * learners
         counts["bodies.selection.offspring"] = bodies.selection.offspring or 0
     for place, found in counts.items():
 
@@ -46,8 +52,12 @@ def check_memory(config: Config, num_genes: int) -> None:
 
         if free is not None and need(found) > free:
             most = max(0, bisect.bisect_right(range(found), free, key=need) - 1)
-            fits = f"at most {most}, as {free / 1e9:.3g} GB of memory are free"
-            raise InputError(f"{config.origin(place)}{place}", fits, found)
+            raise _too_large(config, place, most, free, found)
+
+
+def _too_large(config: Config, place: str, most: int, free: int, found: int) -> InputError:
+    fits = f"at most {most}, as {free / 1e9:.3g} GB of memory are free"
+    return InputError(f"{config.origin(place)}{place}", fits, found)
 
 
 def free_memory(root: Path = Path("/")) -> int | None:

@@ -257,12 +257,12 @@ class Run:
         files = self.folder
         if self.resumed:
             files.rewind(self.checkpoint)
-            files.save_config(self.config)
             resumption = {"time": timestamp(), "generation": self.generation, "argv": sys.argv}
             resumed = [*files.info.get("resumed", []), resumption]
             files.update_info(
                 settings=self._settings, resumed=resumed, finished=None, champion=None
             )
+            files.save_config(self.config)
         files.update_info(workers=self.executor.describe())
         # Where the body is the same for all, it is there from the start.
         if isinstance(self.executor.fitness, Fitness):
@@ -343,15 +343,16 @@ class Run:
         }
         keep = config.evolution.keep_checkpoints
         arrays = self.evolution.to_arrays(self.search)
+        # A run that is killed behind its last checkpoint has nothing left that would write them.
+        for name, content in self.evolution.files(self.search).items() if self.generation else ():
+            self.folder.write(name, content)
         self.folder.save_checkpoint(self.generation, arrays, meta, keep)
         if self.generation:
             self._save_best()
         self._unsaved = False
 
     def _save_best(self) -> None:
-        """Writes the champion so far, and the search's files beside it."""
-        for name, content in self.evolution.files(self.search).items():
-            self.folder.write(name, content)
+        """Writes the champion so far."""
         best = self.evolution.best(self.search)
         if best is None:
             return

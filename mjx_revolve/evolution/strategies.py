@@ -34,6 +34,8 @@ _OTHER_NAMES = {
     "learnedes": "LES",
     "learnedga": "LGA",
 }
+# Strategies whose state holds the draws of a population, which `tell` uses.
+_REMEMBER = ("xNES", "MA_ES", "LM_MA_ES", "CR_FM_NES")
 # The score of a failed rollout if no rollout of its generation has a score.
 FAILED_SCORE = -1e6
 # The step size never falls below this fraction of `std_init`: under noisy scores, a smaller step
@@ -154,6 +156,18 @@ class Strategy:
         population, algorithm = self.algorithm.ask(key, state["algorithm"], self.params)
         return np.asarray(population), _on_host({"fresh": state["fresh"], "algorithm": algorithm})
 
+    def with_mean_first(self, state: State) -> State:
+        """The state after `ask` if the mean takes the place of the first of the population.
+
+        Some strategies remember what they drew, and would learn from a draw that was not tried.
+        """
+        if self.name not in _REMEMBER:
+            return state
+        algorithm = state["algorithm"]
+        drawn = {x: getattr(algorithm, x) for x in ("z", "y") if hasattr(algorithm, x)}
+        first = {name: np.concatenate([0 * x[:1], x[1:]]) for name, x in drawn.items()}
+        return state | {"algorithm": algorithm.replace(**first)}
+
     def tell(
         self, key: jax.Array, population: np.ndarray, scores: np.ndarray, state: State
     ) -> State:
@@ -236,10 +250,10 @@ def _constructor_settings(
     keywords: dict[str, Any] = {}
     used: dict[str, float] = {}
     if "std_schedule" in takes:
-        used["std_decay"] = float(settings.get("std_decay", 0.98))
-        keywords["std_schedule"] = optax.exponential_decay(
-            std_init, 1, used["std_decay"], end_value=STD_FLOOR * std_init
-        )
+        decay = used["std_decay"] = float(settings.get("std_decay", 0.98))
+        # Of a step that grows, optax takes an end for the most.
+        end = STD_FLOOR * std_init if decay < 1 else None
+        keywords["std_schedule"] = optax.exponential_decay(std_init, 1, decay, end_value=end)
     if "optimizer" in takes and name not in ("SNES", "xNES", "DES", "SimpleES"):
         # The four left out follow the natural gradient, for which a plain step of 1 is right.
         used["learning_rate"] = float(settings.get("learning_rate", 0.2 * std_init))
@@ -288,7 +302,7 @@ def _make_strategy(
     settings: dict[str, Any] = json.loads(params_json)
     for key in ("learning_rate", "std_decay"):
         value = settings.get(key, 1.0)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
             raise InputError(f"evolution.strategy_params.{key}", "a number > 0", repr(value))
     keywords, used = _constructor_settings(name, settings, std_init, size, num_genes)
     if name == "LM_MA_ES" and size > 2 * num_genes:  # beyond, its first c_c > 2: a negative root

@@ -557,8 +557,11 @@ def _check_signals(signals: Mapping[str, TimeSeries], robot: Robot) -> list[str]
                     f"{name}: expected radians; found steps of {rate:.3g} a second: degrees? "
                     f"(--map {name}=COLUMN*0.01745, or a column that ends in _deg)"
                 )
-    _check_motion(signals, robot)
     frames = {n: signals[n] for n in seen}
+    most = max((len(signal.time) for signal in frames.values()), default=3)
+    if most < 3 and "mean_speed" not in signals:
+        raise InputError(f"expected three frames or more; found {most}")
+    _check_motion(signals, robot)
     return [*_gaps(frames), *_sampled_commands(signals, frames, robot)]
 
 
@@ -574,9 +577,6 @@ def _check_motion(signals: Mapping[str, TimeSeries], robot: Robot) -> None:
                 "world.surface_height=HEIGHT)?"
             )
     still = "mean_speed" not in signals
-    places = [len(s.time) for n, s in signals.items() if n in _PLACE or n.startswith("mark.")]
-    if still and places and max(places) < 3:
-        raise InputError(f"expected three frames or more; found {max(places)}")
     for name, signal in signals.items():
         if not (name in _PLACE or name.startswith("mark.")) or len(signal.time) < 3:
             continue

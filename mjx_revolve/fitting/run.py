@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import yaml
 from annotated_types import Ge
 
 from mjx_revolve.body.catalogue import MODULES, load_modules
@@ -29,7 +28,8 @@ from mjx_revolve.inputs.files import read_file, write_atomic
 from mjx_revolve.inputs.overrides import read_overrides
 from mjx_revolve.inputs.schema import Integer, Text, TupleOf, checked, read
 from mjx_revolve.inputs.shipped import find_shipped, list_shipped
-from mjx_revolve.inputs.yaml_reader import dump_yaml, load_yaml
+from mjx_revolve.inputs.trust import audit
+from mjx_revolve.inputs.yaml_reader import dump_yaml, load_yaml, parse_yaml
 from mjx_revolve.numerics import runtime
 from mjx_revolve.water.currents import find_field
 from mjx_revolve.water.world import load_world, read_world_files
@@ -336,8 +336,10 @@ def _pack(recordings: Sequence[RobotRecording]) -> bytes:
 
 def _unpack(path: Path) -> tuple[RobotRecording, ...]:
     try:
-        with np.load(io.BytesIO(read_file(path)), allow_pickle=False) as data:
-            about = yaml.safe_load(data["about"].tobytes())
+        content = read_file(path)
+        audit(path, "data", content)
+        with np.load(io.BytesIO(content), allow_pickle=False) as data:
+            about = parse_yaml(data["about"].tobytes(), path)
             found = []
             for r, one in enumerate(about):
                 signals = {

@@ -95,8 +95,8 @@ NonNegative = Annotated[Number, Ge(0)]
 Positive = Annotated[Number, Gt(0)]
 Share = Annotated[Number, Ge(0), Le(1), Unit("-")]
 
-Integer = Annotated[int, Strict()]
-Boolean = Annotated[bool, Strict()]
+Integer = Annotated[int, Strict(), BeforeValidator(_plain)]
+Boolean = Annotated[bool, Strict(), BeforeValidator(_plain)]
 Text = Annotated[str, Strict()]
 
 TupleOf = Annotated[tuple[T, ...], Strict(), BeforeValidator(as_tuple)]

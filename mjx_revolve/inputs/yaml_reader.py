@@ -101,7 +101,23 @@ def _construct_mapping(loader: SafeLoader, node: yaml.MappingNode) -> dict[Hasha
     return mapping
 
 
+# YAML 1.1 takes 012 for 10 and 1:30 for 90, YAML 1.2 for neither.
+_OTHER_BASE = re.compile(r"[-+]?0[0-7_]|.*:")
+
+
+def _check_base(node: yaml.ScalarNode) -> None:
+    if _OTHER_BASE.match(node.value):
+        expected = "a number without a leading 0 or a colon, or a text in quotes"
+        raise InputError(_line_of(node), expected, node.value)
+
+
+def _construct_float(loader: SafeLoader, node: yaml.ScalarNode) -> float:
+    _check_base(node)
+    return loader.construct_yaml_float(node)
+
+
 def _construct_int(loader: SafeLoader, node: yaml.ScalarNode) -> int:
+    _check_base(node)
     value = yaml.SafeLoader.construct_yaml_int(loader, node)
     if value.bit_length() > _MAX_BITS:  # hexadecimal digits may be as many as there are
         raise InputError(_line_of(node), "a whole number of a few digits", "a huge integer")
@@ -114,6 +130,7 @@ def _refuse_tag(loader: SafeLoader, node: yaml.Node) -> None:
 
 SafeLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _construct_mapping)
 SafeLoader.add_constructor("tag:yaml.org,2002:int", _construct_int)
+SafeLoader.add_constructor("tag:yaml.org,2002:float", _construct_float)
 for _name in ("binary", "omap", "pairs", "set"):  # bytes, tuples and sets: no file of ours has any
     SafeLoader.add_constructor(f"tag:yaml.org,2002:{_name}", _refuse_tag)
 

@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.lazy import jax, jnp
 from mjx_revolve.numerics.spatial import (
     Scalar,
@@ -100,8 +99,6 @@ class FinWakeNumbers(PlateNumbers):
 
 def _numbers(parts: PartShapes, world: World) -> FinWakeNumbers:
     plate = LIFT_DRAG.numbers(parts, world)
-    if np.any(plate.radial_symmetry):
-        raise InputError("lift_drag.radial_symmetry", "false with drag: fin_wake", "true")
     chord = (np.abs(plate.forward) * 2 * parts.half_size).sum(-1)
     stall = plate.alpha_stall
     left = np.pi / 2 - stall

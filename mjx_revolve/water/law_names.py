@@ -88,19 +88,19 @@ def _read_coefficients(value: Any) -> Any:
     return tuple(sorted(given.items()))
 
 
-def _read_per_axis(value: Any) -> Any:
+def _read_per_axis(value: Any, place: str = "") -> Any:
     """A number, or three of them, one for each axis."""
     value = as_tuple(value)
     several = value if isinstance(value, tuple) else (value,)
     plain = all(isinstance(x, int | float) and not isinstance(x, bool) for x in several)
     if len(several) not in (1, 3) or not plain or not all(0 <= x <= LARGEST for x in several):
-        raise ConstraintError("", "a number >= 0, or three, one for each axis", show(value))
+        raise ConstraintError(place, "a number >= 0, or three, one for each axis", show(value))
     return tuple(map(float, value)) if isinstance(value, tuple) and len(value) == 3 else value
 
 
 PerAxis = Annotated[
     float | tuple[float, float, float],
-    BeforeValidator(_read_per_axis),
+    BeforeValidator(lambda value: _read_per_axis(value)),
     words("a number >= 0, or three, one for each axis"),
 ]
 """A coefficient of all faces of a part, or of those across each of its axes."""
@@ -141,7 +141,7 @@ def _read_factors(value: Any) -> Any:
     for name, factor in given.items():
         if name not in known:
             raise ConstraintError("", f"names of coefficients ({', '.join(known)})", show(name))
-        given[name] = _read_per_axis(factor)
+        given[name] = _read_per_axis(factor, name)
         if isinstance(given[name], tuple) and not known[name][0]:
             raise ConstraintError(name, "one number >= 0", show(factor))
     return tuple(sorted(given.items()))

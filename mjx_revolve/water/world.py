@@ -245,7 +245,9 @@ def load_world(name: str | Path, **overrides: Any) -> World:
         below = fields.get(key)
         if key == "bed" and isinstance(below, int | float):
             below = {"height": below}
-        if key != "waves" and isinstance(below, Mapping) and isinstance(value, Mapping):
+        if isinstance(below, Mapping) and isinstance(value, Mapping):
+            if key == "waves" and {"period", "wavelength"} & set(value):  # one stands for the other
+                below = {k: x for k, x in below.items() if k not in ("period", "wavelength")}
             kind = below.get("kind", "flat")
             alike = value.get("kind", kind) == kind
             overrides[key] = {**below, **value} if alike else value

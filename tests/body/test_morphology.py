@@ -22,6 +22,7 @@ from mjx_revolve.body.morphology import (
     save_morphology,
     trim_neutral,
 )
+from mjx_revolve.body.table import summary
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.inputs.errors import InputError
 
@@ -281,7 +282,7 @@ body:
     1:
       type: ActiveHinge
       params: {drag: ellipsoid, drag_coefficient: 2, added_mass_coefficient: 3}
-    2: {type: FixedBrick, params: {lift_drag: {cla: 2.0}}}
+    2: {type: FixedBrick, params: {lift_drag: {cla: 2.0}, coefficients: {friction: 0.02}}}
     3: {type: Fin, params: {lift_drag: {cla: 2.0}, drag: faces}}
 """
     robot = read(tmp_path, text)
@@ -292,7 +293,7 @@ body:
     for part in hinge:
         assert (part.drag, part.drag_coefficient) == ("ellipsoid", 2)
         assert part.added_mass_coefficient == 3
-    assert brick.lift_drag == LiftDrag(cla=2.0)
+    assert (brick.lift_drag, brick.coefficients) == (LiftDrag(cla=2.0), (("friction", 0.02),))
     assert fin.lift_drag == replace(MODULES["Fin"].parts[0].lift_drag, cla=2.0)
     assert fin.drag == "faces"
     assert robot.num_fins == 2 and robot.descriptors["num_bricks"] == 0
@@ -357,6 +358,7 @@ def test_trim_neutral(tmp_path):
     brick = "{type: FixedBrick, params: {buoyancy: 'off'}}"
     dead = trim_neutral(read(tmp_path, f"body: {{type: Core, children: {{1: {brick}}}}}"), WATER)
     assert (dead.volume - dead.modules[1].kind.volume) * WATER == pytest.approx(dead.mass)
+    assert "N (neutral)" in "\n".join(summary(dead, WATER, 9.81))
     # Salt water carries more: the electronics shrink.
     salt = trim_neutral(trimmed, 1025.0)
     assert salt.volume * 1025.0 == pytest.approx(salt.mass)

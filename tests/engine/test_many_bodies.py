@@ -119,7 +119,7 @@ def mixed_acceleration(robots, capacity, each, arrays):
 
 
 @pytest.mark.slow
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", WORLDS)
 def test_accelerations_are_those_of_each_body_alone(name):
     robots = zoo(name)

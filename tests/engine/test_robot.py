@@ -201,7 +201,9 @@ def test_what_an_edited_model_may_not_change():
         robot.with_model(edit)
     edit = copy.copy(robot.mj_model)
     edit.jnt_stiffness[2] = 1.0
-    with pytest.raises(InputError, match="servos only; found another jnt_stiffness"):
+    edit.qpos0[8], edit.dof_damping[2], edit.actuator_biasprm[1, 0] = 0.1, 1.0, 0.1
+    words = "another jnt_stiffness, qpos0, dof_damping of the core, actuator_biasprm"
+    with pytest.raises(InputError, match=words):
         robot.with_model(edit)
     spec = robot.mj_spec
     spec.geoms[0].size = [-1.0, 0.0, 0.0]

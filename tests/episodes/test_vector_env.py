@@ -274,9 +274,22 @@ def test_wrong_calls_get_one_message(config):
         env.step(np.zeros((2, 1)))
     with pytest.raises(InputError, match="autoreset_mode: expected none, as this is a single Env"):
         make_env(config, autoreset_mode="SameStep")
-    for seed in (-1, 2**32, 0.5, [1, 2, 3], [None], ["a", None], "a", [2**64, 1], [[1], [2, 3]]):
+    for seed in (
+        -1,
+        2**32,
+        0.5,
+        [1, 2, 3],
+        [None],
+        ["a", None],
+        "a",
+        b"ab",
+        [2**64, 1],
+        [[1], [2, 3]],
+    ):
         with pytest.raises(InputError, match="seed: expected a whole number"):
             env.reset(seed=seed)
+    for given in (np.array(5), jnp.int32(5), np.array([5, 6]), jnp.arange(5, 7)):
+        assert env._read_seeds(given).tolist() == [5, 6]
     with pytest.raises(InputError, match="render_mode: expected none, as nothing is drawn"):
         make_env(config, render_mode="rgb_array")
     with pytest.raises(InputError, match="sensors: expected a list; found 5"):

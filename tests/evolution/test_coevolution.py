@@ -254,6 +254,9 @@ def test_reevaluated_scores_are_means_over_starts_that_no_brain_was_chosen_on(fo
         assert logged[one.number] == one.score
         ages.add(len(scores))
     assert len(ages) > 1
+    assert {one.number: logged[one.number] for one in search.elites} == {
+        one.number: one.score for one in search.elites
+    }
 
 
 def test_what_workers_lose_costs_no_score_and_a_blow_up_costs_all(folder, monkeypatch):

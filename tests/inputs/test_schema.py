@@ -29,6 +29,7 @@ from mjx_revolve.inputs.schema import (
     words,
 )
 from mjx_revolve.inputs.short_repr import short_repr
+from mjx_revolve.inputs.yaml_reader import parse_yaml
 
 
 @checked
@@ -60,6 +61,7 @@ class Tree:
 
 
 def test_values_become_plain():
+    assert read(Integer, np.int64(3)) == 3 and read(Boolean, np.bool_(True)) is True
     tree = Tree(
         "oak",
         axis=np.array([0.0, 3.0, 4.0]),
@@ -78,6 +80,12 @@ def test_values_become_plain():
     plain = [*tree.axis, *tree.place, tree.leaves[0].length]
     assert {type(x) for x in plain} == {float}
     assert read(Tree, {"name": "oak", "first": {"length": 3}}).first == Leaf(3)
+
+
+@pytest.mark.parametrize("text", ["012", "-0777", "1:30", "1:30.5"])
+def test_numbers_of_other_bases_are_refused(text):
+    with pytest.raises(InputError, match="a number without a leading 0 or a colon"):
+        parse_yaml(f"a: {text}".encode(), "x.yaml")
 
 
 def test_they_are_frozen_dataclasses():

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from laboratory import accelerate, at_rest, box_robot, check_refused, face_drag, march, world
+from laboratory import accelerate, at_rest, box_robot, check_refused, face_drag, march, read, world
+from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.lift_drag import (
     LIFT_DRAG,
     LiftDrag,
@@ -281,6 +283,15 @@ def test_own_density_area_and_symmetry_reach_the_step(p):
     qvel[:3] = np.random.default_rng(12).normal(size=(3, 20))
     force = wrench(qvel[:3], p, area=p.area or SIZE[0] * SIZE[1])[0]
     assert accelerate(robot, qpos, qvel)[:3] == pytest.approx(force / MASS, rel=1e-9, abs=1e-9)
+
+
+def test_a_radial_plate_stands_beside_fins_but_has_no_wake():
+    radial = "{type: Fin, params: {lift_drag: {radial_symmetry: true}%s}}"
+    text = f"body: {{type: Core, children: {{0: {radial}, 1: {{type: Fin}}}}}}"
+    tank = world(drag="cross_flow")
+    build_robot(read(text % ""), tank).fluid  # noqa: B018
+    with pytest.raises(InputError, match="radial_symmetry: expected false with drag: fin_wake"):
+        build_robot(read(text % ", drag: fin_wake"), tank).fluid  # noqa: B018
 
 
 def test_plate_drifts_to_the_current():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -102,7 +103,7 @@ def load_catalogue(paths: Sequence[str], world: str | None = None) -> RobotCatal
         "engine": "population", "task.duration": _WHILE, "task.horizon": None
     }  # fmt: skip
     if world is not None:
-        load_world(world)  # what is wrong of it is said of the option
+        load_world(os.path.expanduser(world))  # what is wrong of it is said of the option
     config = override_config(config, changes | ({} if world is None else {"world": world}))
     water = read_world(config)
     drafts: list[_Draft] = []
