@@ -34,7 +34,7 @@ _OTHER_NAMES = {
     "learnedes": "LES",
     "learnedga": "LGA",
 }
-# Strategies whose state holds the draws of a population, which `tell` uses.
+# Strategies with the draws of a population in their state, which `tell` uses.
 _REMEMBER = ("xNES", "MA_ES", "LM_MA_ES", "CR_FM_NES")
 # The score of a failed rollout if no rollout of its generation has a score.
 FAILED_SCORE = -1e6
