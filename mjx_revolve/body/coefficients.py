@@ -109,7 +109,7 @@ def _correct(module: Module, entries: Entries, source: str) -> Module:
     if params == module.params:
         return module
     # Of the type and all params at once, as the saved robot is read.
-    with reading(f"{source}: modules.{module.name}"):
+    with reading(f"{source}: {module.name}"):
         return replace(module, kind=apply_overrides(kind, params), params=params, base=kind)
 
 

@@ -95,7 +95,7 @@ def summary(morphology: Morphology, density: float, gravity: float) -> list[str]
         ("centre of volume at rest", " ".join(_meters(morphology.center_of_volume)), "m"),
         ("weight in air", f"{weight:.4f}", "N"),
         (f"buoyancy in water of {density:g} kg/m³", f"{buoyancy:.4f}", "N"),
-        ("net weight in water", f"{net:.4f}", f"N ({verdict})"),
+        ("net weight in water", f"{net:z.4f}", f"N ({verdict})"),
         ("relative density", f"{relative:.5f}", "mass / mass of displaced water"),
     ]
     rows += [

@@ -168,7 +168,9 @@ def _make_class() -> type:
                 whole = isinstance(x, int | np.integer) and not isinstance(x, bool)
                 return x is None or (whole and 0 <= x < 2**32)
 
-            given: Any = np.asarray(seed).tolist() if hasattr(seed, "dtype") else seed
+            given: Any = seed
+            if jnp.issubdtype(getattr(seed, "dtype", object), jnp.integer):
+                given = np.asarray(seed).tolist()
             several = isinstance(given, Sequence) and not isinstance(given, str | bytes)
             each = list(given) if several else [given]
             if not all(map(fits, each)) or len(each) != (self.num_envs if several else 1):

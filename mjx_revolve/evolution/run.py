@@ -343,16 +343,18 @@ class Run:
         }
         keep = config.evolution.keep_checkpoints
         arrays = self.evolution.to_arrays(self.search)
-        # A run that is killed behind its last checkpoint has nothing left that would write them.
-        for name, content in self.evolution.files(self.search).items() if self.generation else ():
-            self.folder.write(name, content)
         self.folder.save_checkpoint(self.generation, arrays, meta, keep)
         if self.generation:
             self._save_best()
         self._unsaved = False
 
+    def _save_files(self) -> None:
+        for name, content in self.evolution.files(self.search).items():
+            self.folder.write(name, content)
+
     def _save_best(self) -> None:
-        """Writes the champion so far."""
+        """Writes the champion so far, and the search's files beside it."""
+        self._save_files()
         best = self.evolution.best(self.search)
         if best is None:
             return
@@ -372,6 +374,7 @@ class Run:
         """
         config = self.config
         say("judging the champion on fresh starts")
+        self._save_files()  # a run may have been killed right behind its last checkpoint
         champion = self.evolution.choose_champion(self.search)
         facts: dict[str, object] = {
             "score": champion.score,

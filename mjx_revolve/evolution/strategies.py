@@ -35,7 +35,9 @@ _OTHER_NAMES = {
     "learnedga": "LGA",
 }
 # Strategies with the draws of a population in their state, which `tell` uses.
-_REMEMBER = ("xNES", "MA_ES", "LM_MA_ES", "CR_FM_NES")
+_REMEMBER = (
+    "xNES", "MA_ES", "LM_MA_ES", "CR_FM_NES", "GuidedES", "NoiseReuseES", "PersistentES",
+)  # fmt: skip
 # The score of a failed rollout if no rollout of its generation has a score.
 FAILED_SCORE = -1e6
 # The step size never falls below this fraction of `std_init`: under noisy scores, a smaller step
@@ -164,7 +166,8 @@ class Strategy:
         if self.name not in _REMEMBER:
             return state
         algorithm = state["algorithm"]
-        drawn = {x: getattr(algorithm, x) for x in ("z", "y") if hasattr(algorithm, x)}
+        names = [x for x in ("z", "y", "pert", "pert_accum") if hasattr(algorithm, x)]
+        drawn = {name: getattr(algorithm, name) for name in names}
         first = {name: np.concatenate([0 * x[:1], x[1:]]) for name, x in drawn.items()}
         return state | {"algorithm": algorithm.replace(**first)}
 

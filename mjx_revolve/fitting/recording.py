@@ -576,9 +576,10 @@ def _check_motion(signals: Mapping[str, TimeSeries], robot: Robot) -> None:
                 f" m: does z point down (--map {name}=COLUMN*-1), or begin elsewhere (--set "
                 "world.surface_height=HEIGHT)?"
             )
-    still = "mean_speed" not in signals
-    for name, signal in signals.items():
-        if not (name in _PLACE or name.startswith("mark.")) or len(signal.time) < 3:
+    places = {n: s for n, s in signals.items() if n in _PLACE or n.startswith("mark.")}
+    still = "mean_speed" not in signals and any(len(s.time) > 2 for s in places.values())
+    for name, signal in places.items():
+        if len(signal.time) < 3:
             continue
         # Between quantiles: single frames may be wrong.
         speed = float(np.quantile(np.abs(np.diff(signal.value) / np.diff(signal.time)), 0.75))

@@ -102,22 +102,22 @@ def _construct_mapping(loader: SafeLoader, node: yaml.MappingNode) -> dict[Hasha
 
 
 # YAML 1.1 takes 012 for 10 and 1:30 for 90, YAML 1.2 for neither.
-_OTHER_BASE = re.compile(r"[-+]?0[0-7_]|.*:")
+_OCTAL = re.compile(r"[-+]?0[0-7_]")
 
 
-def _check_base(node: yaml.ScalarNode) -> None:
-    if _OTHER_BASE.match(node.value):
+def _check_base(node: yaml.ScalarNode, octal: bool) -> None:
+    if ":" in node.value or (octal and _OCTAL.match(node.value)):
         expected = "a number without a leading 0 or a colon, or a text in quotes"
         raise InputError(_line_of(node), expected, node.value)
 
 
 def _construct_float(loader: SafeLoader, node: yaml.ScalarNode) -> float:
-    _check_base(node)
+    _check_base(node, octal=False)
     return loader.construct_yaml_float(node)
 
 
 def _construct_int(loader: SafeLoader, node: yaml.ScalarNode) -> int:
-    _check_base(node)
+    _check_base(node, octal=True)
     value = yaml.SafeLoader.construct_yaml_int(loader, node)
     if value.bit_length() > _MAX_BITS:  # hexadecimal digits may be as many as there are
         raise InputError(_line_of(node), "a whole number of a few digits", "a huge integer")

@@ -220,8 +220,8 @@ def load_world(name: str | Path, **overrides: Any) -> World:
     Args:
         name: "empty_underwater", "lake", or the path of a YAML file with fields of `World`.
         **overrides: fields that replace those of the file; a mapping (`bed`, `lift_drag`, `shear`,
-            `gust`, `surface_tension`) replaces what it names, a bed of another `kind` the whole
-            bed; see `make_world`.
+            `gust`, `surface_tension`, one of `waves`) replaces what it names; a bed of another
+            `kind`, or an amplitude with a length or period, the whole; see `make_world`.
 
     Returns:
         The world.
@@ -246,8 +246,10 @@ def load_world(name: str | Path, **overrides: Any) -> World:
         if key == "bed" and isinstance(below, int | float):
             below = {"height": below}
         if isinstance(below, Mapping) and isinstance(value, Mapping):
-            if key == "waves" and {"period", "wavelength"} & set(value):  # one stands for the other
+            length = {"period", "wavelength"} & set(value)
+            if key == "waves" and length:  # one stands for the other; with it, a wave may be whole
                 below = {k: x for k, x in below.items() if k not in ("period", "wavelength")}
+                below = {} if "amplitude" in value else below
             kind = below.get("kind", "flat")
             alike = value.get("kind", kind) == kind
             overrides[key] = {**below, **value} if alike else value

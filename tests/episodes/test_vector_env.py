@@ -274,18 +274,9 @@ def test_wrong_calls_get_one_message(config):
         env.step(np.zeros((2, 1)))
     with pytest.raises(InputError, match="autoreset_mode: expected none, as this is a single Env"):
         make_env(config, autoreset_mode="SameStep")
-    for seed in (
-        -1,
-        2**32,
-        0.5,
-        [1, 2, 3],
-        [None],
-        ["a", None],
-        "a",
-        b"ab",
-        [2**64, 1],
-        [[1], [2, 3]],
-    ):
+    wrong = (-1, 2**32, 0.5, [1, 2, 3], [None], ["a", None], "a", b"ab", jax.random.key(0),
+             np.array(0.5), [2**64, 1], [[1], [2, 3]])  # fmt: skip
+    for seed in wrong:
         with pytest.raises(InputError, match="seed: expected a whole number"):
             env.reset(seed=seed)
     for given in (np.array(5), jnp.int32(5), np.array([5, 6]), jnp.arange(5, 7)):

@@ -86,6 +86,7 @@ def test_values_become_plain():
 def test_numbers_of_other_bases_are_refused(text):
     with pytest.raises(InputError, match="a number without a leading 0 or a colon"):
         parse_yaml(f"a: {text}".encode(), "x.yaml")
+    assert parse_yaml(b"[07.5, '012', 0x1f, 0]", "x.yaml") == [7.5, "012", 31, 0]
 
 
 def test_they_are_frozen_dataclasses():
