@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import shlex
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mjx_revolve.evolution.interrupts import Interrupts
@@ -29,6 +29,7 @@ from mjx_revolve.inputs.commands import (
     check_run_arguments,
     describe_refusal,
     program,
+    program_again,
     read_path,
     read_seed,
     run_command,
@@ -127,7 +128,7 @@ def _lead(
         raise InputError(f"--resume {folder}", "no --out beside it", arguments.out)
     trust = arguments.trust
     config = _check(arguments, files=make_fitness is None)
-    print(plain(f"loading {folder or path}"), flush=True)  # it takes seconds
+    _say(plain(f"loading {folder or path}"))  # it takes seconds
     if make_fitness is None and not arguments.cluster and runtime.expects_cpu():
         # They import JAX and the rest while this process does.
         from mjx_revolve.evolution.executor import choose_workers
@@ -193,28 +194,36 @@ def _evolve(run: Run, interrupts: Interrupts) -> int:
     """Evolves a run with checked arguments."""
     config, place = run.config, short_path(run.folder.path)
     if run.is_finished:
-        print(
+        _say(
             f"{place}: finished after {run.generation} {run.unit}s; to go on: "
             f"--set evolution.generations={2 * run.generation}"
         )
         return 0
-    print(plain(_describe(run)), flush=True)
+    _say(plain(_describe(run)))
     if run.resumed:
-        print(f"resuming {run.resumption}", flush=True)
+        _say(f"resuming {run.resumption}")
     interrupts.finish_first("finishing what is under way")
     champion = run.evolve(interrupts, _save_pictures)
     if champion is None:
         saved = f"stopped after {run.unit} {run.generation}; all of it is saved"
-        print(f"{saved}\n{_resume_hint(run)}", flush=True)
+        _say(f"{saved}\n{_resume_hint(run)}")
         return interrupts.exit_code
     from mjx_revolve.view.results import describe_score
 
-    print(f"champion: {describe_score(champion, config)} ({champion.origin})")
+    _say(f"champion: {describe_score(champion, config)} ({champion.origin})")
     if champion.measures:
         figures = (f"{name} {value:.3g}" for name, value in champion.measures.items())
-        print(f"measures: {', '.join(figures)}")
-    print(f"run folder: {place}")
+        _say(f"measures: {', '.join(figures)}")
+    _say(f"run folder: {place}")
     return 0
+
+
+def _say(text: str) -> None:
+    """A line on standard output; if nothing reads it any more, the run goes on in silence."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _save_pictures(run: Run, champion: Champion) -> None:
@@ -264,10 +273,8 @@ def _search_words(config: Config) -> str:
 
 
 def _resume_hint(run: Run) -> str:
-    python = Path(sys.executable)
-    name = short_path(python) if python.is_relative_to(Path.cwd()) else "python"
     place = shlex.quote(short_path(run.folder.path))
-    return f"resume: {program('evolve', shlex.quote(name))} --resume {place}"
+    return f"resume: {program_again('evolve')} --resume {place}"
 
 
 if __name__ == "__main__":

@@ -21,8 +21,10 @@ from mjx_revolve.inputs.commands import (
     Parser,
     check_place,
     program,
+    program_again,
     read_path,
     read_seed,
+    read_world,
     run_command,
 )
 from mjx_revolve.inputs.errors import InputError, plain
@@ -62,7 +64,7 @@ def _parser() -> argparse.ArgumentParser:
         help="where a signal is: NAME=COLUMN, NAME=COLUMN*FACTOR, NAME=NUMBER, mark.NAME=MODULE:"
         "X,Y,Z, or a YAML file of them; may be repeated")  # fmt: skip
     add("--plan", action="store_true", help="plan a programme of motions; takes no recordings")
-    add("--world", help="of a morphology: a name or a YAML (default: lake)")
+    add("--world", type=read_world, help="of a morphology: a name or a YAML (default: lake)")
     add("--modules", type=read_path, metavar="MY.yaml", help="module types of your own")
     add("--seed", type=read_seed, default=0, metavar="N", help="of the search's first draws")
     add("--out", type=read_path, metavar="DIR", help="the fit's folder (default: runs/fit-TIME)")
@@ -168,9 +170,8 @@ def _finish(run: FitRun, interrupts: Interrupts) -> int:
     interrupts.finish_first("finishing the step that is under way")
     fit = run.run(interrupts)
     if fit is None:
-        print(
-            f"stopped; all of it is saved\nresume: {program('fit')} --resume {shlex.quote(place)}"
-        )
+        again = f"{program_again('fit')} --resume {shlex.quote(place)}"
+        print(f"stopped; all of it is saved\nresume: {again}")
         return interrupts.exit_code
     with interrupts.writing:
         run.write(fit, make_fit_page(fit))

@@ -12,7 +12,14 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from mjx_revolve.inputs.commands import Parser, program, read_path, run_command, whole
+from mjx_revolve.inputs.commands import (
+    Parser,
+    program,
+    read_path,
+    read_world,
+    run_command,
+    whole,
+)
 from mjx_revolve.inputs.errors import plain
 from mjx_revolve.inputs.trust import add_trust_argument, opening
 from mjx_revolve.numerics.runtime import prepare_process
@@ -52,7 +59,7 @@ def main(argv: list[str] | None = None) -> int:
         "morphologies, or shipped ones' names; the first run or configuration says how robots are "
         "controlled, and where (default: lake_swim's)",
     )  # fmt: skip
-    parser.add_argument("--world", help="another world: a name or a YAML")
+    parser.add_argument("--world", type=read_world, help="another world: a name or a YAML")
     parser.add_argument(
         "--port", type=whole(0, 65535), default=0, metavar="N",
         help="of the page on 127.0.0.1 (default: any that is free)",

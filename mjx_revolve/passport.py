@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 
+from mjx_revolve.evolution.interrupts import Interrupts
 from mjx_revolve.inputs.commands import Parser, check_place, program, read_path, run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import short_path, write_atomic
@@ -38,7 +39,8 @@ def main(argv: list[str] | None = None) -> int:
     runtime.fix_threads()
     from mjx_revolve.episodes.run_reader import RunReader, find_run
 
-    with opening(arguments.run, trust=arguments.trust):
+    # While programs are compiled, only a thread of its own can end the process.
+    with Interrupts("interrupted"), opening(arguments.run, trust=arguments.trust):
         folder = find_run(arguments.run)
         champion = RunReader(folder).load_champion()
         config = champion.load_config()  # before JAX is imported

@@ -21,6 +21,7 @@ from mjx_revolve.inputs.commands import (
     add_run_arguments,
     check_run_arguments,
     program,
+    program_again,
     read_path,
     run_command,
     whole,
@@ -29,6 +30,7 @@ from mjx_revolve.inputs.errors import plain
 from mjx_revolve.inputs.files import short_path
 from mjx_revolve.inputs.grids import MOST_SEEDS, read_axes
 from mjx_revolve.inputs.shipped import find_shipped
+from mjx_revolve.inputs.trust import add_trust_argument
 from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
@@ -57,6 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--out", type=read_path, metavar="DIR",
         help="the sweep's folder (default: runs/CONFIG-sweep-X, X by --set)")  # fmt: skip
     add_run_arguments(parser)
+    add_trust_argument(parser)
     return parser
 
 
@@ -97,18 +100,19 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     folder = Path(arguments.out) if arguments.out else _usual_folder(sweep)
     check_folder(folder)
     default_page(folder)  # refuses now what it would refuse after days
-    steps = choose_steps(sweep.plans(folder.absolute()), make_fitness)
+    steps = choose_steps(sweep.plans(folder.absolute()), make_fitness, arguments.trust)
     write_sweep(folder, sweep)
     cases = len(sweep.cases)
     print(f"{cases} case{'s' * (cases > 1)}, {sweep.seeds} seed{'s' * (sweep.seeds > 1)} each | "
           f"{short_path(folder)}", flush=True)  # fmt: skip
-    again = f"{program('sweep')} {shlex.join(argv)}"
+    again = f"{program_again('sweep')} {shlex.join(argv)}"
     workers, cluster = arguments.workers, arguments.cluster
     code = run_plans(
         steps,
         lambda config: make_executor(config, workers, make_fitness, cluster),
         save_pictures,
         again,
+        arguments.trust,
     )
     if code not in (0, 2):  # runs that failed by themselves leave the others to report on
         return code

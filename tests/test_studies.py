@@ -117,6 +117,8 @@ def test_champions_are_judged_at_rest_and_over_the_horizon(tmp_path, started, mo
         made.append((config.task.duration, config.task.horizon))
         return make_toy_bodies(config)
 
+    shore = environments.ENVIRONMENTS["shore"]._replace(settings=())  # with the horizon of all
+    monkeypatch.setitem(environments.ENVIRONMENTS, "shore", shore)
     monkeypatch.setattr(studies, "MAKE_FITNESS", make_fitness)
     monkeypatch.setattr(
         environments, "write_report", lambda _, outcomes: found.extend(outcomes) or {"runs": []}

@@ -15,7 +15,7 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -23,10 +23,16 @@ from mjx_revolve.episodes.config import Config, load_config
 from mjx_revolve.inputs.commands import check_no_fit, check_no_sweep
 from mjx_revolve.inputs.errors import InputError, reading, show
 from mjx_revolve.inputs.files import SWEEP, check_path, read_file
-from mjx_revolve.inputs.schema import Number, TupleOf, read
+from mjx_revolve.inputs.schema import Number, Text, TupleOf, read, words
 from mjx_revolve.inputs.yaml_reader import load_yaml
 
 _CHECKPOINT = re.compile(r"generation_(\d+)\.npz")
+# What is read of `run.json`.
+_INFO: Mapping[str, Any] = {
+    "settings": TupleOf[Text],
+    "resumed": Annotated[list[Any], words("a list")],
+    "champion": Annotated[dict[Text, Any], words("a mapping")],
+}
 
 
 def find_run(path: str | Path) -> Path:
@@ -87,6 +93,8 @@ class RunReader:
             raise InputError(f"{path}: expected JSON; found: {error}") from None
         if not isinstance(info, dict):
             raise InputError(path, "a JSON object", type(info).__name__)
+        for name in _INFO.keys() & info.keys():
+            read(_INFO[name], info[name], f"{path}: {name}")
         return info
 
     @property

@@ -155,9 +155,20 @@ class ClusterExecutor(WorkerExecutor[ClusterWorker]):
         is_file = place.endswith(".json") or os.path.isfile(place)
         if is_file and not os.path.isfile(place):  # Dask would wait for it
             raise InputError("--cluster", "a scheduler file", f"none at {place}")
+
+        class Client(distributed.Client):  # type: ignore[misc]  # Dask has no types
+            """Lets go at once of what could not be connected; Dask's own waits for a minute."""
+
+            def __init__(self, **settings: object) -> None:
+                try:
+                    super().__init__(**settings)
+                except Exception:
+                    self.close(timeout=1)
+                    raise
+
         try:
             where = {"scheduler_file" if is_file else "address": place}
-            self._client = distributed.Client(**where, set_as_default=False)
+            self._client = Client(**where, set_as_default=False)
         except Exception as error:  # Dask raises anything about addresses, files and TLS
             found = describe_error(error)
             raise InputError(f"--cluster {place}", "a Dask scheduler", found) from None

@@ -20,7 +20,6 @@ from typing import NoReturn
 _SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
-_EARLY = "interrupted before the run began"
 
 
 class Interrupts:
@@ -36,8 +35,9 @@ class Interrupts:
             `writing` is held.
     """
 
-    def __init__(self) -> None:
-        """No signal so far."""
+    def __init__(self, early: str = "interrupted before the run began") -> None:
+        """No signal so far; `early`: the line before `finish_first`."""
+        self._early = early
         self.signal: int | None = None
         self.writing = threading.Lock()
         self.rescue: Callable[[], None] = lambda: None
@@ -95,7 +95,7 @@ class Interrupts:
             count += 1
             _leave_lost_terminal()
             if self._answer is None:
-                self._end(number, _EARLY)
+                self._end(number, self._early)
             elif count > 1:
                 self._end(number, "ended at once; what was finished is saved")
             self._ask(number)

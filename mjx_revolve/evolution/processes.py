@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -50,6 +51,8 @@ _TICK = 0.25
 # How much of the end of a worker's log is read [bytes].
 _TAIL = 4096
 _log = logging.getLogger(__name__)
+# Of a worker.
+_scratch: str | None = None
 
 
 # ------------------------------------------------------------------ in the worker
@@ -64,8 +67,10 @@ def serve(descriptor: int) -> NoReturn:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    with contextlib.suppress(EOFError, OSError):
+    try:
         _work(Connection(descriptor))
+    except (EOFError, OSError):  # its end, as that of standard input, is that of the run's process
+        _remove_scratch()
     # JAX's clean-up at exit takes a tenth of a second, and a worker has nothing to clean up.
     sys.stderr.flush()
     os._exit(0)
@@ -74,18 +79,26 @@ def serve(descriptor: int) -> NoReturn:
 def _end_with_parent() -> NoReturn:
     while os.read(0, 1):
         pass
+    _remove_scratch()
     os._exit(1)
 
 
+def _remove_scratch() -> None:
+    """Removes the workers' temporary folder, which a process that is killed leaves behind."""
+    if _scratch is not None:
+        shutil.rmtree(_scratch, ignore_errors=True)
+
+
 def _work(channel: Connection) -> None:
+    global _scratch
     core, cache = channel.recv()
     try:
         runtime.prepare_worker(core, cache)
         from mjx_revolve.evolution.blocks import evaluate_block, key_from_data
         from mjx_revolve.evolution.fingerprints import identify
 
-        job, scratch = channel.recv()
-        fitness = open_job(job, scratch)
+        job, _scratch = channel.recv()
+        fitness = open_job(job, _scratch)
         compile_job(job, fitness)
         if core is not None:
             runtime.pin_process([core])

@@ -132,7 +132,7 @@ class Run:
         if out:
             check_new_folder(out)  # before the expensive part
         place = Path(out) if out else _RUNS / "any"
-        check_place(place / "any", f"--out {place}")
+        check_place(place / "any", f"--out {place}" if out else str(_RUNS))
         executor = _prepare(config, make_executor)
         check_search(config, executor)
         info = {

@@ -232,13 +232,14 @@ class SharedExecutor:
 
 
 def choose_steps(
-    plans: Sequence[Plan], make_fitness: MakeFitness | None = None
+    plans: Sequence[Plan], make_fitness: MakeFitness | None = None, trust: bool = False
 ) -> dict[Plan, Step]:
     """The next step of each run, after all checks of its configuration.
 
     Args:
         plans: the runs.
         make_fitness: see `executor.make_executor`.
+        trust: whether Python files of another's run folder may run.
 
     Raises:
         InputError: a configuration is wrong, alone or for its robot, world and strategy, or a run
@@ -258,7 +259,7 @@ def choose_steps(
                 seen.add(plan.case)
                 config = plan.config
                 check_tensorboard(config, config.source)
-                with opening_config(plan.base):
+                with opening_config(plan.base, trust):
                     check_search(config, executors(config))
             except InputError as error:
                 raise InputError(f"{plan.case}: {error}" if several else str(error)) from None
@@ -270,6 +271,7 @@ def run_plans(
     make_executor: MakeExecutor,
     draw: Callable[[Run, Champion], None],
     again: str,
+    trust: bool = False,
 ) -> int:
     """Runs what is not finished, with a line on standard output for each.
 
@@ -280,6 +282,7 @@ def run_plans(
         make_executor: makes the executor of a run.
         draw: writes the pictures of a run, when its champion is evaluated.
         again: the command that goes on.
+        trust: as in `choose_steps`.
 
     Returns:
         The exit code: 0 when all are finished, 130 or 143 when interrupted, 1 when the disk refused
@@ -306,7 +309,7 @@ def run_plans(
             print(f"{begin}running ... ", end="", flush=True)
             started = time.perf_counter()
             try:
-                champion = _run(plan, step, executors, draw, interrupts, number)
+                champion = _run(plan, step, executors, draw, interrupts, number, trust)
             except (WorkerError, OSError) as error:
                 words = describe_refusal(error) if isinstance(error, OSError) else str(error)
                 print(f"{over}failed\ngo on: {again}", flush=True)
@@ -314,6 +317,8 @@ def run_plans(
                 return 1
             except InputError as error:  # nothing of this run can be judged; the others go on
                 print(f"{over}failed", flush=True)
+                if str(error).startswith(("--cluster", "--workers")):  # it is the same for all
+                    raise
                 print(f"error: {plan.name}: {error}", file=sys.stderr)
                 code, left = 2, left - 1
                 continue
@@ -341,6 +346,7 @@ def _run(
     draw: Callable[[Run, Champion], None],
     interrupts: Interrupts,
     label: str,
+    trust: bool,
 ) -> Champion | None:
     """Begins a run or goes on with it; None where it was interrupted before its end."""
     folder, log = plan.folder, plan.folder.with_name(f"{plan.folder.name}.log")
@@ -348,11 +354,11 @@ def _run(
     with contextlib.ExitStack() as opened:
         out = opened.enter_context(log.open("a", encoding="utf-8"))
         if step == "continue":
-            with opening(folder, trust=False):
+            with opening(folder, trust=trust):
                 run = Run.resume(str(folder), None, _changes(plan), executors)
             print(f"resuming {plan.name} {run.resumption}", file=out, flush=True)
         else:
-            with opening_config(plan.base):
+            with opening_config(plan.base, trust):
                 place = str(folder)
                 run = Run.begin(
                     str(plan.base), plan.overrides, place, executors, interrupts.writing

@@ -12,6 +12,7 @@ import json
 import logging
 import math
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import Any, NoReturn
 
 from mjx_revolve.inputs import early_sigint
 from mjx_revolve.inputs.errors import InputError, plain
-from mjx_revolve.inputs.files import SWEEP, check_path, read_file
+from mjx_revolve.inputs.files import SWEEP, check_path, read_file, short_path
 from mjx_revolve.inputs.packages import check_mujoco
 from mjx_revolve.inputs.shipped import list_shipped
 from mjx_revolve.inputs.trust import add_trust_argument, opening
@@ -42,6 +43,13 @@ def program(name: str, python: str = "python") -> str:
     whole = (own.parent.name, own.name) == ("mjx_revolve", "__main__.py")
     whole |= name.partition(" ")[0] == "import"  # which no module may be called
     return f"{python} -m mjx_revolve{' ' if whole else '.'}{name}"
+
+
+def program_again(name: str) -> str:
+    """How to call a command with this Python, from the current folder."""
+    python = Path(sys.executable)
+    own = short_path(python) if python.is_relative_to(Path.cwd()) else "python"
+    return program(name, shlex.quote(own))
 
 
 class Parser(argparse.ArgumentParser):
@@ -71,6 +79,11 @@ def refuse_blank(text: str, what: str = "an address or a file") -> str:
     if not text.strip():
         raise argparse.ArgumentTypeError(f"expected {what}; found {text!r}")
     return text
+
+
+def read_world(text: str) -> str:
+    """Reads the name or file of a world, for `add_argument(type=read_world)`; refuses ""."""
+    return refuse_blank(text, "a world's name or file")
 
 
 def read_path(text: str) -> str:
@@ -153,7 +166,9 @@ def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
         "--individual", type=whole(0), metavar="N",
         help="number of an individual of the run, where bodies evolve (default: the champion)",
     )  # fmt: skip
-    parser.add_argument("--world", help="of a morphology: a name or a YAML (default: lake)")
+    parser.add_argument(
+        "--world", type=read_world, help="of a morphology: a name or a YAML (default: lake)"
+    )
     parser.add_argument(
         "--modules", type=read_path, metavar="MY.yaml",
         help="of a morphology: module types of your own (a run's are in its folder)",

@@ -173,5 +173,5 @@ def call_user_function(
         return function(*arguments)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InputError(explain(error, path, expected)) from None
