@@ -127,6 +127,7 @@ def test_a_changed_file_is_read_anew_and_an_unchanged_one_is_not(folder):
     [
 ("", "override task.type: expected a function rise in {own}; found no function in it"),
 ("raise SystemExit(3)", "{own}: line 1: expected Python that runs; found SystemExit: 3"),
+("def rise(track, settings):\n    raise SystemExit", "line 2: expected rise to score a track"),
 ("def rise(track, settings):\n    return track.height", "{own}: line 2: expected rise to "
          "score a track; found AttributeError: 'Track' object has no attribute 'height'"),
 ("def rise(track, settings):\n    return track.position[:, 2]", "{own}: rise: expected a "

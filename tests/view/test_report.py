@@ -185,6 +185,8 @@ DAMAGES = [
      "run reached 6"),
     (break_cell, "damaged", "metrics.csv: 1 of 6 generations are not in it"),
     (lambda run: cut(run / "run.json"), "damaged", "run.json: expected JSON; found"),
+    (lambda run: edit(run / "run.json", '"settings": ', '"resumed": 5, "settings": '), "damaged",
+     "run.json: resumed: expected a list; found 5"),
     (lambda run: (run / "config.yaml").unlink(), "incomplete", "config.yaml is missing"),
     (lambda run: edit(run / "config.yaml", "trials: 1", "trials: 1\n  trails: 2"),
      "of another version", "task.trails: expected one of "),
