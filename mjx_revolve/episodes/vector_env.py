@@ -6,6 +6,7 @@ made. All environments are stepped in one compiled call.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
@@ -169,8 +170,9 @@ def _make_class() -> type:
                 return x is None or (whole and 0 <= x < 2**32)
 
             given: Any = seed
-            if jnp.issubdtype(getattr(seed, "dtype", object), jnp.integer):
-                given = np.asarray(seed).tolist()
+            if hasattr(seed, "dtype"):
+                with contextlib.suppress(TypeError):  # a key of JAX
+                    given = np.asarray(seed).tolist()
             several = isinstance(given, Sequence) and not isinstance(given, str | bytes)
             each = list(given) if several else [given]
             if not all(map(fits, each)) or len(each) != (self.num_envs if several else 1):

@@ -163,7 +163,8 @@ class ClusterExecutor(WorkerExecutor[ClusterWorker]):
                 try:
                     super().__init__(**settings)
                 except Exception:
-                    self.close(timeout=1)
+                    with contextlib.suppress(Exception):  # it may have hardly begun
+                        self.close(timeout=1)
                     raise
 
         try:

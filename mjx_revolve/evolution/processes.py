@@ -103,9 +103,9 @@ def _work(channel: Connection) -> None:
         if core is not None:
             runtime.pin_process([core])
         channel.send(identify(fitness))
-    except EOFError:
-        raise
     except Exception as error:
+        if _scratch is None and isinstance(error, EOFError):  # of the pipe, not of a user's code
+            raise
         channel.send(describe_error(error))
         return
     while True:

@@ -34,10 +34,9 @@ _OTHER_NAMES = {
     "learnedes": "LES",
     "learnedga": "LGA",
 }
-# Strategies with the draws of a population in their state, which `tell` uses.
-_REMEMBER = (
-    "xNES", "MA_ES", "LM_MA_ES", "CR_FM_NES", "GuidedES", "NoiseReuseES", "PersistentES",
-)  # fmt: skip
+# Strategies with the draws of a population in their state, which `tell` uses. Those that draw
+# mirrored pairs (GuidedES, NoiseReuseES, PersistentES) are none: a pair would lose its half.
+_REMEMBER = ("xNES", "MA_ES", "LM_MA_ES", "CR_FM_NES")
 # The score of a failed rollout if no rollout of its generation has a score.
 FAILED_SCORE = -1e6
 # The step size never falls below this fraction of `std_init`: under noisy scores, a smaller step
@@ -166,8 +165,7 @@ class Strategy:
         if self.name not in _REMEMBER:
             return state
         algorithm = state["algorithm"]
-        names = [x for x in ("z", "y", "pert", "pert_accum") if hasattr(algorithm, x)]
-        drawn = {name: getattr(algorithm, name) for name in names}
+        drawn = {x: getattr(algorithm, x) for x in ("z", "y") if hasattr(algorithm, x)}
         first = {name: np.concatenate([0 * x[:1], x[1:]]) for name, x in drawn.items()}
         return state | {"algorithm": algorithm.replace(**first)}
 

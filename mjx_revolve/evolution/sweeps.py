@@ -318,6 +318,8 @@ def run_plans(
             except InputError as error:  # nothing of this run can be judged; the others go on
                 print(f"{over}failed", flush=True)
                 if str(error).startswith(("--cluster", "--workers")):  # it is the same for all
+                    if ran:
+                        print(f"go on: {again}", flush=True)
                     raise
                 print(f"error: {plan.name}: {error}", file=sys.stderr)
                 code, left = 2, left - 1

@@ -577,7 +577,8 @@ def _check_motion(signals: Mapping[str, TimeSeries], robot: Robot) -> None:
                 "world.surface_height=HEIGHT)?"
             )
     places = {n: s for n, s in signals.items() if n in _PLACE or n.startswith("mark.")}
-    still = "mean_speed" not in signals and any(len(s.time) > 2 for s in places.values())
+    level = [s for name, s in places.items() if name != "z"]
+    still = "mean_speed" not in signals and any(len(s.time) > 2 for s in level)
     for name, signal in places.items():
         if len(signal.time) < 3:
             continue
