@@ -18,18 +18,24 @@ import numpy as np
 from experiments import measured_data as data
 from experiments.common import make_parser, write_results
 from experiments.measured_cases import body
+from experiments.water_tank import world as tank
 from mjx_revolve.fitting import FitSettings, RobotRecording, TimeSeries, fit_robot, load_recording
 from mjx_revolve.fitting.recording import read_map
 from mjx_revolve.fitting.result import Fit
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics import runtime
+from mjx_revolve.water.world import World
 
 GLIDE = Path(__file__).parents[2] / "shared" / "swimmers" / "amphibot_glide.csv"
 """The marks' tracks; they are not ours to ship (`AMPHIBOT_GLIDE` says where they are from)."""
 _BEGUN, _FITTED, _ALL = 989.05, 2.05, 4.402  # the joints have stopped; lengths fitted and whole [s]
 _GAIT, _SETTLED = 8.5, 4.5  # length of a swim, and its mean speed is that from here on [s]
 _LEAST = 0.1  # slower gaits are left out of scatters, as in measured.md [m/s]
+
+
+def _pool(drag: str, timestep: float) -> World:
+    return tank(gravity=9.81, buoyancy="partial", drag=drag, added_mass=True, timestep=timestep)
 
 
 def fit_glide(drag: str = "cross_flow") -> Fit:
@@ -56,10 +62,6 @@ def glide_errors(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
         for x in (p.recorded, p.fitted, p.before)
     ]
     return ways[1] / ways[0] - 1, ways[2] / ways[0] - 1
-
-
-def _pool(drag: str, timestep: float) -> World:
-    return tank(gravity=9.81, buoyancy="partial", drag=drag, added_mass=True, timestep=timestep)
 
 
 def fit_lamprey(drag: str = "cross_flow") -> Fit:
