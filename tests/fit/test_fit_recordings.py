@@ -183,6 +183,7 @@ def write_bag(path, series, plugin):
 
 
 def test_joints_of_a_bag_of_ours_are_the_modules(tmp_path):
+    pytest.importorskip("rosbags", reason="the package rosbags writes bags")
     robot = build_robot(make_morphology({"type": "Core", "children": {1: {
         "id": "Hinge-1-1", "type": "ActiveHinge"}}}), load_world("lake", bed="off"))  # fmt: skip
     time = 0.05 * np.arange(1, 61)
