@@ -11,6 +11,7 @@ takes minutes and up to 8 GB, in `--out`, and is removed afterwards.
 
 from __future__ import annotations
 
+import datetime
 import json
 import re
 import shutil
@@ -175,7 +176,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         }
         for name, one in found.items():
             title = f"{name}-{_PYTHON}"
-            columns[title] = {"name": title, **one, "found": describe(name, one)}
+            today = datetime.datetime.now(datetime.UTC).date().isoformat()
+            columns[title] = {"name": title, "date": today, **one, "found": describe(name, one)}
         rows = [columns[title] for title in sorted(columns)]
         write_results("installations", {"columns": rows}, ())
     return int(any("failed" in str(step) for one in found.values() for step in one.values()))
