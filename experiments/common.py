@@ -102,18 +102,22 @@ def read_rows(
     path = folder / f"{name}.json"
     if not path.exists():
         return []
+    from mjx_revolve.numerics.runtime import describe_process
+
     known = json.loads(path.read_text("utf-8"))
-    if not any_machine and (here := _machine()) != known["machine"]:
+    if not any_machine and (here := _machine(describe_process())) != known["machine"]:
         raise InputError(str(path), f"rows of this machine, {here}", f"those of {known['machine']}")
     return known["numbers"][rows]
 
 
-def _machine() -> dict[str, Any]:
-    """What times depend on."""
-    from mjx_revolve.numerics.runtime import describe_process
+def _machine(process: Mapping[str, Any]) -> dict[str, Any]:
+    """What times depend on, of what `describe_process` says."""
+    return {key: process[key] for key in ("cpu", "cpu_count", "device")}
 
-    known = describe_process()
-    return {key: known[key] for key in ("cpu", "cpu_count", "device")}
+
+def today() -> str:
+    """The date that results have."""
+    return datetime.datetime.now(datetime.UTC).date().isoformat()
 
 
 def _study_hash() -> str:
@@ -146,9 +150,9 @@ def write_results(
     known = describe_process()
     result = {
         "study": name,
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "date": today(),
         "versions": known["versions"] | {"source": source_hash(), "study": _study_hash()},
-        "machine": _machine(),
+        "machine": _machine(known),
         "seeds": list(seeds),
         "numbers": numbers,
     }

@@ -11,7 +11,6 @@ takes minutes and up to 8 GB, in `--out`, and is removed afterwards.
 
 from __future__ import annotations
 
-import datetime
 import json
 import re
 import shutil
@@ -22,7 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.common import ROOT, make_folder, make_parser, read_rows, write_results
+from experiments.common import ROOT, make_folder, make_parser, read_rows, today, write_results
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
@@ -176,8 +175,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         }
         for name, one in found.items():
             title = f"{name}-{_PYTHON}"
-            today = datetime.datetime.now(datetime.UTC).date().isoformat()
-            columns[title] = {"name": title, "date": today, **one, "found": describe(name, one)}
+            said = describe(name, one)
+            columns[title] = {"name": title, "date": today(), **one, "found": said}
         rows = [columns[title] for title in sorted(columns)]
         write_results("installations", {"columns": rows}, ())
     return int(any("failed" in str(step) for one in found.values() for step in one.values()))

@@ -14,7 +14,6 @@ docs/precision.png and docs/performance.md have them.
 
 from __future__ import annotations
 
-import datetime
 import functools
 import itertools
 import math
@@ -36,6 +35,7 @@ from experiments.common import (
     make_folder,
     make_parser,
     read_rows,
+    today,
     write_results,
 )
 from mjx_revolve.inputs.commands import run_command, whole
@@ -634,8 +634,7 @@ def save(rows: list[dict[str, Any]], folder: Path) -> None:
     known: dict[str, list[dict[str, Any]]] = {}
     for row in read_rows("precision", "rows", folder):
         known.setdefault(row["case"], []).append(row)
-    today = datetime.datetime.now(datetime.UTC).date().isoformat()
-    known[rows[0]["case"]] = [row | {"date": today} for row in rows]
+    known[rows[0]["case"]] = [row | {"date": today()} for row in rows]
     rows = [row for case in CASES for row in known.get(case.name, [])]
     picture = ROOT / "docs" / "precision.png" if folder == RESULTS else folder / "precision.png"
     draw(rows, picture)
