@@ -28,7 +28,6 @@ from mjx_revolve.inputs.commands import (
 from mjx_revolve.inputs.errors import plain
 from mjx_revolve.inputs.files import PAGES, check_name, short_path
 from mjx_revolve.numerics import runtime
-from mjx_revolve.view.viewer import write_colony_page, write_viewer
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -83,6 +82,13 @@ def main(argv: list[str] | None = None) -> int:
     episode = load_asked(arguments)
     name = individual_name(arguments.individual) or "viewer"
     out = arguments.out or _usual_path(episode.folder, name, episode.robot.morphology.name)
+    from mjx_revolve.view.poses import finite_rows
+    from mjx_revolve.view.viewer import write_viewer
+
+    episode, lost = finite_rows(episode)
+    if lost is not None:
+        words = f"the trajectory is not finite from {lost:.4g} s on; shown up to there"
+        print(f"note: {words}", file=sys.stderr)
     write_viewer(episode, out)
     size = Path(out).stat().st_size / 1e6
     length = f"{episode.trajectory.time[-1]:.4g} s"
@@ -101,6 +107,8 @@ def _write_colony(arguments: argparse.Namespace) -> int:
     runtime.prepare_process()
     with opening_episode(arguments):
         seen = record_colony(folder, arguments.time, arguments.duration or DURATION)
+    from mjx_revolve.view.viewer import write_colony_page
+
     written = write_colony_page(seen.robots, out, seen.title, marks=seen.marks, leap=seen.leap)
     span = f"{len(seen.robots)} robots, {seen.start:.4g} to {seen.end:.4g} s"
     print(plain(f"{short_path(out)}: {span}, {written.bytes / 1e6:.2f} MB; open it in a browser"))

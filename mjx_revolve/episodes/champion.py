@@ -285,7 +285,7 @@ def _own_genes(life: LoggedIndividual, count: int) -> np.ndarray:
 def _facts(config: Config, life: LoggedIndividual) -> dict[str, Any]:
     """The title, score and starts of an individual's episode."""
     return {
-        "name": f"individual {life.number}, generation {life.born}",
+        "name": f"individual {life.number}, {config.unit} {life.born}",
         "score": None if math.isnan(life.score) else life.score,
         **_selected(config, life.born),
     }

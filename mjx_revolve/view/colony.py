@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
+
 from mjx_revolve.episodes.run_reader import find_run
 from mjx_revolve.evolution.colony_observer import ObservedRobot, observe_colony, open_colony
 from mjx_revolve.inputs.errors import InputError
@@ -53,7 +55,12 @@ def record_colony(
         marks += [Mark("charger", place, colony.energy.reach) for place in colony.energy.chargers]
     return Recording(
         title=f"{folder.resolve().name}: a colony",
-        robots=[_replayed(one, start, end) for one in observed if one.time[0] <= end],
+        # No robot swims twice the arena from one pose to the next: it has blown up.
+        robots=[
+            _replayed(one, start, end, 2 * colony.arena.size)
+            for one in observed
+            if one.time[0] <= end
+        ],
         start=start,
         end=end,
         marks=marks,
@@ -62,13 +69,16 @@ def record_colony(
     )
 
 
-def _replayed(observed: ObservedRobot, start: float, end: float) -> ReplayRobot:
-    one, shown = observed.individual, observed.time <= end + 1e-6
+def _replayed(observed: ObservedRobot, start: float, end: float, far: float) -> ReplayRobot:
+    one = observed.individual
+    gone = np.linalg.norm(np.diff(observed.qpos[:, :3], axis=0), axis=1) > far
+    shown = (observed.time <= end + 1e-6) & ~np.r_[False, np.logical_or.accumulate(gone)]
     died = observed.end is not None and observed.end <= end + 1e-6
+    unmeasured = "none" if observed.cause == "failed" else "not measured yet"
     info: dict[str, str | float] = {
         "born": f"{observed.born:.0f} s",  # which may be long before the recording begins
         "parents": " and ".join(f"#{number}" for number in one.parents) or "none",
-        "fitness": "not measured yet" if math.isnan(one.score) else f"{one.score:.3g}",
+        "fitness": unmeasured if math.isnan(one.score) else f"{one.score:.3g}",
         "modules": one.body.counts.replace(" modules", "", 1),
     }
     if died:

@@ -35,6 +35,8 @@ class Outcome(NamedTuple):
         task: the task's type, and "in metres" where its scores are.
         unit: of the scores; "" where it is not known.
         evolved: whether bodies have evolved.
+        colony: whether in a colony, whose fitness is not its champion's score.
+        generations: that the run was to have, or intervals.
     """
 
     plan: Plan
@@ -45,6 +47,8 @@ class Outcome(NamedTuple):
     task: str = ""
     unit: str = ""
     evolved: bool = True
+    colony: bool = False
+    generations: int = 0
 
 
 def find_outcomes(
@@ -68,7 +72,17 @@ def find_outcomes(
             place = short_path(plan.folder)
             words = " ".join(str(error).split())
             lost.append(f"{place}: expected a whole run; found: {words.removeprefix(place + ': ')}")
-    return found, lost
+    # In a study that was made longer, a run that has not gone on yet is not finished.
+    longest: dict[str, int] = {}
+    for one in found:
+        longest[_typed(one)] = max(longest.get(_typed(one), 0), one.generations)
+    return [one for one in found if one.generations == longest[_typed(one)]], lost
+
+
+def _typed(outcome: Outcome) -> str:
+    """The generations that a run is to have, as they were typed; "" for those of its base."""
+    typed = dict(setting.split("=", 1) for setting in outcome.plan.settings)
+    return typed.get("evolution.generations", "")
 
 
 def _read_outcome(plan: Plan, add: Callable[[str, Figures], Figures]) -> Outcome:
@@ -98,8 +112,8 @@ def _read_outcome(plan: Plan, add: Callable[[str, Figures], Figures]) -> Outcome
     task = config.task.type
     unit = score_unit(task, config.task.unit) if task in TASKS else ""
     task += " in metres" * (config.task.unit == "m")
-    evolved = config.bodies is not None
-    return Outcome(plan, champion, population, metrics, body, task, unit, evolved)
+    kind = config.bodies is not None, config.colony is not None, config.evolution.generations
+    return Outcome(plan, champion, population, metrics, body, task, unit, *kind)
 
 
 def by_case(outcomes: Sequence[Outcome], cases: Iterable[str]) -> dict[str, list[Outcome]]:

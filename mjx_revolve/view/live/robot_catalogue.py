@@ -130,7 +130,8 @@ def load_catalogue(paths: Sequence[str], world: str | None = None) -> RobotCatal
         sensed = config.controller.sensors is not None or more[0].body.sensors is None
         if sensed and _can_swim(more[0].body, water):
             drafts += [x for x in more if (x.short, x.name) not in known]
-    title = " and ".join(Path(path).stem or path for path in paths)
+    names = (Path(x).name if Path(x).is_dir() else Path(x).stem for x in paths)
+    title = " and ".join(name or path for name, path in zip(names, paths, strict=True))
     # Drafts are trimmed, as far as they can be; many share a body.
     bodies = {id(draft.body): draft.body for draft in drafts}
     mixed = make_mixed_fitness(override_config(config, {"trim": "none"}), [*bodies.values()])

@@ -122,7 +122,7 @@ def _values(fit: Fit) -> str:
         for v, p in zip(fit.values, fit.problem.parameters, strict=True)
     ]
     header = ("number", "found\nfactor, or as said", f"interval\n{LEVEL:.0%}", "before\n95 %")
-    return sections.fit_table(header, rows)
+    return sections.table(header, rows)
 
 
 def _recordings(fit: Fit) -> str:

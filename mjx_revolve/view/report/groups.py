@@ -14,6 +14,7 @@ from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.settings import NamedFile, map_files
 from mjx_revolve.evolution.fingerprints import FREE_SETTINGS
 from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.view.plots import letter
 from mjx_revolve.view.report.record import RunRecord, number
 
 # Settings that do not make it another configuration: they only say how it is kept.
@@ -68,7 +69,7 @@ class RunGroup:
         return [score for score in found if score is not None]
 
     def best_after(self, generations: int) -> list[float]:
-        """The best so far that each run had after so many generations, if it has got there."""
+        """The best so far that each run had after so many generations, or at its end."""
         early = [
             r.metrics["champion"][r.metrics["generation"] <= generations]
             for r in self.shown if "champion" in r.metrics
@@ -185,7 +186,7 @@ def _names(
         names.append(name if len(name) <= _LABEL else name[: _LABEL - 1] + "…")
     # Whatever is still the same gets a letter.
     return [
-        f"{name} ({chr(ord('a') + names[:k].count(name) % 26)})" if names.count(name) > 1 else name
+        f"{name} ({letter(names[:k].count(name)).lower()})" if names.count(name) > 1 else name
         for k, name in enumerate(names)
     ]
 

@@ -281,8 +281,10 @@ def _convergence(groups: Sequence[RunGroup]) -> str:
     styles = {group.name: k for k, group in enumerate(groups)}
     shown = [group for group in groups if group.shown]
     comparisons = []
-    for task in dict.fromkeys(group.task for group in shown):
-        members = [group for group in groups if group.task == task]
+    # A colony's fitness is not that of other runs, though their champions have one task.
+    kinds = {group.name: (group.task, group.records[0].fitness) for group in groups}
+    for kind in dict.fromkeys(kinds[group.name] for group in shown):
+        members = [group for group in groups if kinds[group.name] == kind]
         if sum(len(group.shown) for group in members) > 1:
             comparisons.append(svg_source(convergence.plot_comparison(members, styles)))
     entries = []

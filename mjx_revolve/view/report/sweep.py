@@ -11,13 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from mjx_revolve.episodes.run_reader import RunReader
 from mjx_revolve.evolution.sweeps import Plan, Sweep, read_sweep
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import short_path, write_atomic
 from mjx_revolve.inputs.grids import read_axes
 from mjx_revolve.view.body_pictures import plot_bodies
-from mjx_revolve.view.convergence import plot_cases
+from mjx_revolve.view.convergence import COLONY_LABEL, plot_cases
 from mjx_revolve.view.outcomes import (
     Outcome,
     by_case,
@@ -131,17 +130,22 @@ def make_report(
     numbered = {cases.index(case): found for case, found in known.items()}
     tasks = dict.fromkeys(found[0].task for found in numbered.values())
     content: list[tuple[str, str, str]] = []
+    unequal = [
+        axis.key
+        for axis in read_axes(sweep.settings)
+        if len(axis.texts) > 1 and axis.key.startswith("task.") and axis.key != "task.type"
+    ]
     for n, task in enumerate(tasks):
         members = {k: found for k, found in numbered.items() if found[0].task == task}
         of = f": {task.replace('_', ' ')}" if len(tasks) > 1 else ""
         content += [
-            (f"scores-{n}", f"Scores{of}", _scores(members, names)),
+            (f"scores-{n}", f"Scores{of}", _scores(members, names, unequal)),
             (f"tests-{n}", f"Tests{of}", _tests(members, names)),
             (f"measures-{n}", f"Measures{of}", _measures(members)),
         ]
     content += [
         ("bodies", "Bodies", _bodies(numbered)),
-        ("runs", "Runs", _runs(plans, outcomes, named, folder.resolve() == at.resolve())),
+        ("runs", "Runs", _runs(plans, outcomes, lost, named, folder.resolve() == at.resolve())),
         ("repeat", "Repeat it", sections.sweep_repeat(_command(sweep, folder), settings)),
     ]
     lead = sections.headline([
@@ -185,9 +189,10 @@ def _range(outcomes: Sequence[Outcome], name: str) -> str:
 # --- scores ---------------------------------------------------------------------------------------
 
 
-def _scores(members: Numbered, cases: Sequence[str]) -> str:
+def _scores(members: Numbered, cases: Sequence[str], unequal: Sequence[str]) -> str:
     """Means and intervals of the champions' scores, a dot for each seed, and the way there."""
-    unit = next(iter(members.values()))[0].unit
+    first = next(iter(members.values()))[0]
+    unit = first.unit
     header = ["", "case", "n\nseeds", f"mean score\n{unit}", f"best seed\n{unit}"]
     header += ["evaluations\neach", "time of generations\ns each"]
     scores = {k: _values(found, "score") for k, found in members.items()}
@@ -201,9 +206,9 @@ def _scores(members: Numbered, cases: Sequence[str]) -> str:
     ]  # fmt: skip
     curves = {k: [(o.metrics["evaluations"], o.metrics["champion"]) for o in found]
               for k, found in members.items()}  # fmt: skip
-    best = with_unit("best score so far", unit)
+    best = f"best {COLONY_LABEL}" if first.colony else with_unit("best score so far", unit)
     figure = plot_cases(dict(enumerate(cases)), curves, scores, "evaluated individuals", best, unit)
-    return sections.sweep_scores(header, rows, svg_source(figure))
+    return sections.sweep_scores(header, rows, svg_source(figure), unequal)
 
 
 def _tests(members: Numbered, cases: Sequence[str]) -> str:
@@ -260,7 +265,11 @@ def _bodies(numbered: Numbered) -> str:
 
 
 def _runs(
-    plans: Sequence[Plan], outcomes: Sequence[Outcome], cases: Mapping[str, str], near: bool
+    plans: Sequence[Plan],
+    outcomes: Sequence[Outcome],
+    lost: Sequence[str],
+    cases: Mapping[str, str],
+    near: bool,
 ) -> str:
     """A line for each run, with a link to its folder where the page is near: beside the cases."""
     found = {o.plan: o for o in outcomes}
@@ -270,7 +279,7 @@ def _runs(
         if near and plan.folder.is_dir():
             address = f"{plan.case}/{plan.folder.name}/"
             link = Markup('<a href="{}">{}</a>').format(address, link)
-        figures = ["–", "–", "–", _state(plan)]
+        figures = ["–", "–", "–", _state(plan, lost)]
         if outcome is not None:
             figures = [f"{outcome.metrics['generation'][-1]:.0f}",
                        format_number(outcome.champion["score"]),
@@ -279,11 +288,8 @@ def _runs(
     return sections.sweep_runs(rows)
 
 
-def _state(plan: Plan) -> str:
+def _state(plan: Plan, lost: Sequence[str]) -> str:
     """Of a run that has no outcome."""
-    try:
-        if RunReader(plan.folder).is_finished:
-            return "damaged"
-    except InputError:
+    if any(line.startswith(f"{short_path(plan.folder)}: ") for line in lost):
         return "damaged"
     return "not finished" if plan.folder.is_dir() else "not begun"

@@ -144,11 +144,13 @@ def task_tables(groups: Sequence[RunGroup]) -> list[TaskTable]:
 def _task_table(members: Sequence[tuple[int, RunGroup]]) -> TaskTable:
     groups = [group for _, group in members]
     unit, first = groups[0].unit, groups[0]
-    reached = min((group.common_generations for group in groups if group.shown), default=0)
+    alike = [group for group in groups if group.records[0].fitness == first.records[0].fitness]
+    reached = min((group.common_generations for group in alike if group.shown), default=0)
     known = _known_measures(record for group in groups for record in group.records)
     header = ["", "configuration", "n\nseeds", f"score\n{unit}", f"best seed\n{unit}"]
     header += [f"less the first\n{unit}"] * (len(groups) > 1)
-    header += [f"after {reached} gen.\nbest so far", *map(_column, known)]
+    rounds = {"generation": "gen."}.get(first.records[0].round, f"{first.records[0].round}s")
+    header += [f"after {reached} {rounds}\nbest so far", *map(_column, known)]
     rows: list[list[Cell]] = []
     for index, group in members:
         scores = group.scores()
@@ -157,7 +159,7 @@ def _task_table(members: Sequence[tuple[int, RunGroup]]) -> TaskTable:
         rows.append([
             index, group.name, len(scores), str(interval(scores)),
             format_number(max(scores, default=None)), *[less] * (len(groups) > 1),
-            str(interval(group.best_after(reached))),
+            str(interval(group.best_after(reached))) if group in alike else NO_VALUE,
             *(str(interval([v for v in values if v is not None])) for values in measures),
         ])  # fmt: skip
     unequal = [key for key in differences(groups) if key.startswith("task.")]
