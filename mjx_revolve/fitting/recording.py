@@ -354,7 +354,11 @@ def _read_bag(
     links, jets = make_links(robot), robot.morphology.thruster_names
     modules = {
         "JointState": {x.joint.name: robot.mj_model.body(x.body).name for x in links if x.joint},
-        "Float64MultiArray": {plain(name): name for name in jets} | {name: name for name in jets},
+        "Float64MultiArray": {
+            **{str(k): name for k, name in enumerate(jets)},
+            **{plain(name): name for name in jets},
+            **{name: name for name in jets},
+        },
     }
     store: Any = get_typestore(Stores.ROS2_HUMBLE)
     kept: dict[str, list[tuple[float, float]]] = {}
@@ -371,9 +375,11 @@ def _read_bag(
                 if (use := _TOPICS.get(kind)) is None:
                     continue
                 role = f"{kind} {topic}" if kind in _MANY else _role(kind)
+                message = store.deserialize_cdr(raw, connection.msgtype)
+                if kind == "Float64MultiArray" and not _has_names(message, topic):
+                    continue  # such as a sensor's numbers
                 if chosen.setdefault(role, picked.get(role, topic)) != topic:
                     continue
-                message = store.deserialize_cdr(raw, connection.msgtype)
                 for name, value in use(message, topic):
                     if names := modules.get(kind):
                         head, _, module = name.partition(".")
@@ -420,10 +426,15 @@ def _joints(message: Any, topic: str) -> Iterable[tuple[str, float]]:
     yield from ((f"{kind}.{name}", value) for name, value in pairs)
 
 
+def _has_names(message: Any, topic: str) -> bool:
+    """Whether it is known what an array's numbers are: an exported brain's node gives no labels."""
+    return bool(message.layout.dim) or topic.endswith("/thruster_commands")
+
+
 def _array(message: Any, topic: str) -> Iterable[tuple[str, float]]:
-    if message.layout.dim:
-        names = message.layout.dim[0].label.split(",")
-        yield from ((f"command.{n}", x) for n, x in zip(names, message.data, strict=False))
+    dim = message.layout.dim
+    names = dim[0].label.split(",") if dim else map(str, range(len(message.data)))
+    yield from ((f"command.{n}", x) for n, x in zip(names, message.data, strict=False))
 
 
 def _imu(message: Any, topic: str) -> Iterable[tuple[str, float]]:

@@ -89,7 +89,8 @@ _REDUCTIONS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "
 _OF_NOTHING = {"reduce_sum": 0, "dot_general": 0, "reduce_prod": 1,
                "reduce_max": -np.inf, "reduce_min": np.inf}  # fmt: skip
 _NEUTRAL = {"add": 0, "sub": 0, "mul": 1, "div": 1}
-_SAME = ("materialize", "copy", "copy_p", "optimization_barrier", "reduce_precision")
+_SAME = ("materialize", "copy", "copy_p", "optimization_barrier", "reduce_precision",
+         "stop_gradient")  # fmt: skip
 _CALLS = (
     "jit", "pjit", "closed_call", "core_call", "remat", "checkpoint", "custom_jvp_call",
     "custom_vjp_call",
@@ -101,6 +102,7 @@ _MOVES: dict[str, tuple[int, ...] | None] = {
     "stack": None, "unstack": None, "tile": None,
     "gather": (0,), "dynamic_slice": (0,), "dynamic_update_slice": (0, 1), "scatter": (0, 2),
 }  # fmt: skip
+_EVEN = jax.lax.RoundingMethod.TO_NEAREST_EVEN
 _KINDS = {"f": "real", "i": "int", "b": "bool"}
 
 
@@ -306,7 +308,7 @@ class Builder:
         odd = (
             name not in ELEMENTWISE
             or (name in _REALS_ONLY and "real" not in kinds)
-            or (name == "round" and "EVEN" not in str(params["rounding_method"]))
+            or (name == "round" and params["rounding_method"] != _EVEN)
             or (name == "select_n" and (kinds[0] != "bool" or len(args) != 3))
             or (name == "not" and kinds[0] != "bool")
         )

@@ -134,7 +134,8 @@ def _number(x: np.generic) -> str:
 def wrapped(line: str) -> str:
     """A line of code, broken at blanks between brackets where it is long."""
     indent = " " * (len(line) - len(line.lstrip()) + 4)
+    kept = line.replace(" = ", "\xa0=\xa0", 1)  # outside of brackets no line may end
     return "\n".join(
-        textwrap.wrap(line, 100, subsequent_indent=indent, break_long_words=False,
+        textwrap.wrap(kept, 100, subsequent_indent=indent, break_long_words=False,
                       break_on_hyphens=False, drop_whitespace=True)
-    )  # fmt: skip
+    ).replace("\xa0", " ")  # fmt: skip

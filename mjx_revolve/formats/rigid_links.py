@@ -340,7 +340,10 @@ def _load_mesh(name: str, path: Path) -> np.ndarray | None:
     found = (folder / tail for folder in folders for tail in tails)
     file = next((one for one in found if one.is_file()), None)
     try:
-        triangles = np.zeros(0) if file is None else np.asarray(trimesh.load_mesh(file).triangles)
+        mesh = None if file is None else trimesh.load_mesh(file)
+        triangles = np.zeros(0) if mesh is None else np.asarray(mesh.triangles)
+        if name.lower().endswith(".dae") and mesh is not None and mesh.units:  # "0.001 * meters"
+            triangles = triangles * trimesh.units.unit_conversion(mesh.units, "meters")
     except OSError:
         raise
     except Exception:  # its readers raise anything
@@ -374,6 +377,8 @@ def _urdf_hinge(joint: Element, missing: list[str]) -> _Hinge | None:
 # ------------------------------------------------------------------------------------------- MJCF
 
 _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
+# Gain and bias of an actuator whose force is its command times the gain.
+_MOTOR = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE
 _MOVES_JOINTS = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _KINDS = {
     _GEOM.mjGEOM_BOX: "box", _GEOM.mjGEOM_SPHERE: "sphere", _GEOM.mjGEOM_ELLIPSOID: "ellipsoid",
@@ -456,8 +461,13 @@ def _mjcf_hinge(model: mujoco.MjModel, body: int, missing: list[str]) -> tuple[_
     efforts = [model.jnt_actfrcrange[j][1]] if model.jnt_actfrclimited[j] else []
     for k in range(model.nu):
         moves = model.actuator_trntype[k] in _MOVES_JOINTS and model.actuator_trnid[k, 0] == j
+        gear = abs(model.actuator_gear[k, 0])
         if moves and model.actuator_forcelimited[k]:
-            efforts.append(model.actuator_forcerange[k][1] * abs(model.actuator_gear[k, 0]))
+            efforts.append(model.actuator_forcerange[k][1] * gear)
+        kind = model.actuator_gaintype[k], model.actuator_biastype[k]
+        if moves and model.actuator_ctrllimited[k] and kind == _MOTOR:
+            gain = abs(model.actuator_gainprm[k, 0])
+            efforts.append(np.abs(model.actuator_ctrlrange[k]).max() * gain * gear)
     if efforts and min(efforts) > 0:
         limits["effort"] = min(efforts)
     return (model.jnt_axis[j].copy(), model.jnt_pos[j].copy(), limits), model.joint(j).name

@@ -42,8 +42,8 @@ def write_bag(robot: Robot, trajectory: Trajectory, path: Path) -> None:
       motor [N·m] of each hinge;
     - `/joint_targets` (`sensor_msgs/JointState`): the controller's target angles [rad];
     - `/odom` (`nav_msgs/Odometry`): pose in `odom`, velocities in `base_link`;
-    - `/thruster_commands` (`std_msgs/Float64MultiArray`): behind their lag [-], where there are
-      thrusters;
+    - `/thruster_commands` (`std_msgs/Float64MultiArray`): the controller's, before their lag [-],
+      where there are thrusters;
     - `/robot_description` (`std_msgs/String`): the URDF, drawn with boxes, so that RViz and
       Foxglove show the robot without further files.
 
@@ -153,8 +153,6 @@ def _messages(
     torques = motor_torques(robot, qpos, qvel, ctrl, trajectory.variation)
     torques = np.ascontiguousarray(torques, np.float64)
     commands = ctrl[:, list(robot.thrusters)]
-    if trajectory.command is not None:
-        commands = np.asarray(trajectory.command, np.float64)[rows]
     pushing = [robot.mj_model.actuator(k).name for k in robot.thrusters]
 
     first, still = int(stamps[0]), np.array([1.0, 0.0, 0.0, 0.0])

@@ -84,6 +84,7 @@ def make_build_page(robot: Robot, title: str = "") -> str:
         kinds=list_parts(body),
         describe=_describe,
         degrees=math.degrees,
+        amount=_amount,
         balance=balance,
         words=ballast_words(balance),
         centers=[_numbers(x.round(1), 4) for x in (balance.mass_center, balance.lift_center)],
@@ -130,10 +131,12 @@ def _describe(kind: ModuleType, part: Part) -> str:
         (part.ballast_volume, "ballast or float", np.asarray(part.ballast_position)),
     ):
         if volume:
-            words.append(f"{1e6 * volume:.4g} cm³ of {what} at ({_numbers(1e3 * center, 4)}) mm")
+            words.append(
+                f"{_amount(1e6 * volume)} cm³ of {what} at ({_numbers(1e3 * center, 4)}) mm"
+            )
     if part.ballast_mass:
         place = _numbers(1e3 * np.asarray(part.ballast_position), 4)
-        words.append(f"{1e3 * part.ballast_mass:.4g} g of ballast at ({place}) mm")
+        words.append(f"{_amount(1e3 * part.ballast_mass)} g of ballast at ({place}) mm")
     return ", ".join(words)
 
 
@@ -141,25 +144,20 @@ def weigh(robot: Robot) -> Balance:
     """Mass, displaced volume and their centres, the robot at rest."""
     body, world = robot.morphology, robot.world
     density = 0.0 if world.buoyancy == "off" else world.density
-    mass, volume, sealed = 0.0, 0.0, 0.0
-    weighed, lifted = np.zeros(3), np.zeros(3)
+    volume, sealed, lifted = 0.0, 0.0, np.zeros(3)
     for module in body.modules:
         for part in module.kind.parts:
-            for total, center, sums in (
-                (part.total_mass, part.center_of_mass, weighed),
-                (part.lifted_volume, part.displaced_center, lifted),
-            ):
-                local = np.add(part.position, center)
-                sums += total * (module.position + module.rotation @ local)
-            mass, volume = mass + part.total_mass, volume + part.lifted_volume
+            local = np.add(part.position, part.displaced_center)
+            lifted += part.lifted_volume * (module.position + module.rotation @ local)
+            volume += part.lifted_volume
             sealed += part.electronics_volume + part.ballast_volume
     return Balance(
-        mass=1e3 * mass,
+        mass=1e3 * body.mass,
         displaced=1e6 * volume,
         sealed=1e6 * sealed,
         density=density,
-        missing=1e6 * (mass / density - volume) if density else math.nan,
-        mass_center=1e3 * weighed / mass,
+        missing=1e6 * (body.mass / density - volume) if density else math.nan,
+        mass_center=1e3 * body.center_of_mass,
         lift_center=1e3 * lifted / (volume or 1.0),
     )
 
@@ -172,24 +170,24 @@ def ballast_words(balance: Balance) -> list[str]:
     found = []
     if balance.sealed:
         found.append(
-            f"Provide {balance.sealed:.4g} cm³ that is sealed or floats (electronics box, foam), "
-            "where the list of parts has it, in the part's own axes from its middle. Hollows that "
-            "fill with water do not count."
+            f"Provide {_amount(balance.sealed)} cm³ that is sealed or floats (electronics box, "
+            "foam), where the list of parts has it, in the part's own axes from its middle. "
+            "Hollows that fill with water do not count."
         )
     grams = balance.missing * balance.density / 1e3
     if abs(balance.missing) < _SAME * balance.displaced:
         found.append(f"With masses and volumes as in the list it is neutral in {water}.")
     elif grams > 0:
         found.append(
-            f"It sinks in {water}: it needs {balance.missing:.4g} cm³ of float or sealed volume "
-            f"more (or {grams:.4g} g less). Put it above the centre of mass."
+            f"It sinks in {water}: it needs {_amount(balance.missing)} cm³ of float or sealed "
+            f"volume more (or {_amount(grams)} g less). Put it above the centre of mass."
         )
     else:
         steel = -grams / (1 - balance.density / _STEEL)
         found.append(
-            f"It floats in {water}: it needs ballast of {-grams:.4g} g as weighed under water, "
-            f"such as {steel:.4g} g of stainless steel. Put it straight below the centre of "
-            "buoyancy."
+            f"It floats in {water}: it needs ballast of {_amount(-grams)} g as weighed under "
+            f"water, such as {_amount(steel)} g of stainless steel. Put it straight below the "
+            "centre of buoyancy."
         )
     apart = balance.lift_center - balance.mass_center
     if np.linalg.norm(apart) < 1e3 * _ONE_POINT:
@@ -292,6 +290,11 @@ def _axis_words(vector: np.ndarray) -> str:
     if abs(abs(vector[k]) - 1) < 1e-6:
         return ("+" if vector[k] > 0 else "−") + _AXES[k]
     return f"({_numbers(vector, 3)})"
+
+
+def _amount(x: float) -> str:
+    """Four digits, of a large number all before the point: a scale shows them."""
+    return f"{x:.4g}" if abs(x) < 999.95 else f"{x:.0f}"
 
 
 def _numbers(values: Sequence[float] | np.ndarray, digits: int) -> str:

@@ -125,8 +125,11 @@ def test_two_marks_from_above_in_units_of_their_own(fit, signals, tmp_path):
     check(fit(tmp_path / "swim.csv", more=as_map(("bow", "stern"))), 0.05)
 
 
-def write_bag(path, series, plugin):
-    """A ROS 2 bag with poses as odometry or marks, commands, an IMU and depth; times from 100 s."""
+def write_bag(path, series, plugin, arrays=None):
+    """A ROS 2 bag with poses as odometry or marks, commands, an IMU and depth; times from 100 s.
+
+    `arrays` of numbers without names are by their topic.
+    """
     rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="the package rosbags writes bags")
     from rosbags.typesys import Stores, get_typestore
 
@@ -172,6 +175,9 @@ def write_bag(path, series, plugin):
         for t, value in zip(series[name].time[::5], series[name].value[::5], strict=True):
             topic = f"/thrusters/{name.partition('.')[2]}"
             rows.append((t, topic, make("std_msgs/msg/Float64", 100 * float(value))))
+    for topic, values in (arrays or {}).items():
+        layout = make("std_msgs/msg/MultiArrayLayout", [], 0)
+        rows.append((0.0, topic, make("std_msgs/msg/Float64MultiArray", layout, values)))
     with rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[plugin]) as writer:
         topics = {}
         for t, topic, message in sorted(rows, key=lambda row: row[0]):
@@ -192,6 +198,29 @@ def test_joints_of_a_bag_of_ours_are_the_modules(tmp_path):
     write_ros_bag(robot, Trajectory(time, qpos, *none), tmp_path / "swim.mcap")
     found = load_recording(tmp_path / "swim.mcap", robot, {}).signals
     assert found["angle.Hinge-1-1"].value == pytest.approx(np.sin(time)[1::2], abs=1e-6)
+
+
+def test_thrusters_of_a_bag_have_the_commands_before_their_lag(auv, tmp_path):
+    pytest.importorskip("rosbags", reason="the package rosbags writes bags")
+    time, count = 0.05 * np.arange(1, 41), auv.mj_model.nu
+    qpos = np.c_[0.1 * time, np.tile([0.0, -1, 1, 0, 0, 0], (40, 1))]
+    ctrl = np.linspace(0.1, 0.4, count) * np.ones((40, 1))
+    none = np.zeros((40, 6)), np.zeros((40, 3, 3))
+    swum = Trajectory(time, qpos, *none, ctrl, np.zeros(40), command=0.5 * ctrl)
+    write_ros_bag(auv, swum, tmp_path / "swim.mcap")
+    found = load_recording(tmp_path / "swim.mcap", auv, {}).signals
+    for k, name in enumerate(auv.morphology.thruster_names):
+        np.testing.assert_allclose(found[f"command.{name}"].value, ctrl[0, k])
+
+
+def test_an_exported_brains_node_needs_no_labels(auv, signals, tmp_path):
+    """Its commands are in the thrusters' order; other numbers without names are none of theirs."""
+    arrays = {"/sensors/target": np.ones(3), "/thruster_commands": np.arange(auv.mj_model.nu) / 9}
+    some = {name: series for name, series in signals.items() if not name.startswith("command.")}
+    write_bag(tmp_path / "swim", some, "MCAP", arrays)
+    found = load_recording(tmp_path / "swim", auv, {}).signals
+    for k, name in enumerate(auv.morphology.thruster_names):
+        np.testing.assert_allclose(found[f"command.{name}"].value, k / 9)
 
 
 def commands_of(auv):

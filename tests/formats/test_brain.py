@@ -318,17 +318,24 @@ def test_whole_numbers_and_truth_values(tmp_path, spider):
     """A state of all kinds, and shifting from one place of it into the next."""
 
     def step(parameters, state, time, sense):
-        count, odd, late, later = state
+        count, odd, late, later, *more = state  # too many for one line of a file
         found = (
             sense.angle * jnp.where(odd, 1.0, -0.5) + later + 0.01 * (count % 5 + abs(3 - count))
         )
         near = (sense.angle > 0.1) & ~(sense.speed < 0.0) | (count[None] == 2)
         found = found + jnp.where(near, jnp.sign(sense.speed), jnp.floor(sense.angle))
+        found = found + jnp.round(more[0]) + jax.nn.softmax(more[0], 0)
         shifted = jnp.maximum(count + 1, 2) ^ (count & 1)
-        return (shifted, ~odd, sense.angle, late), 0.2 * found
+        return (shifted, ~odd, sense.angle, late, *more[1:], 2 * later), 0.2 * found
 
     zero = jnp.zeros((8, 1))
-    begin = jnp.zeros(1, jnp.int32), jnp.ones(1, bool), zero + 0.1, zero - 0.2
+    begin = (
+        jnp.zeros(1, jnp.int32),
+        jnp.ones(1, bool),
+        zero + 0.1,
+        zero - 0.2,
+        *(zero for _ in range(6)),
+    )
     controller = Controller(0, (), lambda genes, plant: (), lambda parameters: begin, step)
     brain = make_brain(spider, controller, np.zeros(0), 20.0)
     draw, rows, expected = np.random.default_rng(1), [], []

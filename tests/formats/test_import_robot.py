@@ -186,6 +186,9 @@ def test_an_mjcf_of_capsules_and_two_hinges(tmp_path):
     np.testing.assert_allclose(ours.jnt_range[1:], theirs.jnt_range[1:], atol=1e-9)
     hinges = [found.modules[name].hinge for name in ("hip_x", "knee")]
     assert [hinge.effort for hinge in hinges] == [2.0, 1.5]
+    geared = MJCF.replace("forcerange", "ctrlrange").replace("forcelimited", "ctrllimited")
+    other = import_robot(write(tmp_path, geared, "geared.xml")).modules["knee"].hinge
+    assert other.effort == 1.5
     assert found.missing == (
         "hip_y: a joint that is rigid here, as a link has one hinge",
         "1 × geoms of the world",
@@ -305,6 +308,16 @@ def test_mirrored_meshes_have_their_volumes(tmp_path):
     found = import_robot(path)
     assert found.modules["base_1"].volume == pytest.approx(ball.volume, rel=1e-5)
     assert not any("holes" in words for words in found.missing)
+    # In millimetres, as the file says.
+    pytest.importorskip("collada", reason="the package pycollada reads COLLADA")
+    text = ball.apply_scale(1e3).export(file_type="dae").decode()
+    text = text.replace("</asset>", '<unit meter="0.001" name="millimeter" /></asset>')
+    assert text.count("<unit") == 1
+    (tmp_path / "ball.dae").write_text(text)
+    path.write_text(path.read_text().replace("ball.stl", "ball.dae"))
+    assert import_robot(path).modules["base_1"].volume == pytest.approx(
+        found.modules["base_1"].volume
+    )
 
 
 @pytest.mark.parametrize(
