@@ -183,6 +183,7 @@ def _finish(run: FitRun, interrupts: Interrupts) -> int:
 
 def describe(fit: Fit) -> list[str]:
     """What a fit has found, in lines."""
+    from mjx_revolve.fitting.parameters import LARGEST_FACTOR
     from mjx_revolve.fitting.problem import NOISE
 
     lines = []
@@ -205,7 +206,13 @@ def describe(fit: Fit) -> list[str]:
                 f"{kind}: {sigma:.2g} is left, {sigma / NOISE[kind]:.0f} times what is usual: the "
                 "law or the robot is another one, or the search went astray; trust no interval"
             )
-    if not fit.state.finished:
+    pairs = zip(fit.problem.parameters, fit.state.point.free, strict=True)
+    if stuck := ", ".join(p.name for p, x in pairs if p.is_at_bound(float(x))):
+        lines.append(
+            f"{stuck}: at the bound, a factor of {LARGEST_FACTOR:g}: the robot, its units or its "
+            "law is another one; trust no interval"
+        )
+    elif not fit.state.finished:
         lines.append("the search has not arrived: begin anew with more --set iterations")
     if fit.advice:
         lines.append(f"the most informative motion: {fit.advice}")

@@ -12,6 +12,7 @@ from dataclasses import replace
 from mjx_revolve.fitting.estimate import recording_costs
 from mjx_revolve.fitting.problem import NOISE, FitProblem, make_problem
 from mjx_revolve.fitting.recording import TimeSeries
+from mjx_revolve.inputs.errors import InputError
 
 # Another way is named where it leaves a third of the sum of squares. A choice.
 _BETTER = 3.0
@@ -56,7 +57,10 @@ def find_other_axes(problem: FitProblem) -> list[str]:
         pairs = zip(problem.recordings, read, strict=True)
         others = [r if x is None else replace(r, signals=x) for r, x in pairs]
         if any(x is not None for x in read):
-            costs = cost(make_problem(problem.robot, others, free, problem.settings))
+            try:
+                costs = cost(make_problem(problem.robot, others, free, problem.settings))
+            except InputError:  # marks say that it is not so
+                continue
             best = [min(old, (x, words)) for old, x in zip(best, costs, strict=True)]
     return [
         f"{recording.name}: the robot would move far more like this if {words} (--map)"

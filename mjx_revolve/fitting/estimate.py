@@ -284,20 +284,19 @@ def correlation(problem: FitProblem, values: list[np.ndarray]) -> dict[str, floa
             crowded.setdefault(channel.kind, []).append((crowd, rows))
         for k in np.unique(where[channel.fitted]):
             x = left[channel.fitted & (where == k)]
-            a, b = x[:-1].ravel(), x[1:].ravel()
-            known = np.isfinite(a) & np.isfinite(b)
-            if not known.any():  # a mean speed has no neighbour
-                continue
-            square_sum = float(x[np.isfinite(x)] @ x[np.isfinite(x)])
-            both = float(a[known] @ b[known]), square_sum, square_sum * len(x)
-            lagged.setdefault(channel.kind, []).append(both)
+            for column in x.T:
+                own = column[np.isfinite(column)]  # rows of other sensors may lie between
+                if len(own) > 1:  # a mean speed has no neighbour
+                    total = float(own @ own)
+                    both = float(own[:-1] @ own[1:]), total, total * len(own)
+                    lagged.setdefault(channel.kind, []).append(both)
     found = {channel.kind: 1.0 for channel in problem.channels}
     for kind, many in lagged.items():
         product, square_sum, weighted = (sum(x[k] for x in many) for k in range(3))
         rows = max(weighted / max(square_sum, 1e-30), _FEWEST_ROWS)
         # What is fitted takes some of it away (Marriott and Pope 1954).
         rho = (product / max(square_sum, 1e-30) + 1 / rows) / (1 - 3 / rows)
-        rho = min(max(rho, 0.0), 0.95)
+        rho = min(max(rho, 0.0), max(0.95, (rows - 1) / (rows + 1)))
         crowd = 1.0
         if kind in crowded:
             crowd = sum(c * n for c, n in crowded[kind]) / sum(n for _, n in crowded[kind])

@@ -66,6 +66,10 @@ class Parameter:
         most = math.log(LARGEST_FACTOR)
         return min(max(offset, -most), most)
 
+    def is_at_bound(self, offset: float) -> bool:
+        """Whether it can go no farther."""
+        return self.bound(1.001 * offset) != 1.001 * offset
+
 
 def with_values(robot: Robot, parameters: Sequence[Parameter], offsets: np.ndarray) -> Robot:
     """The robot with values of its free numbers."""

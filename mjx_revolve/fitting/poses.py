@@ -60,10 +60,10 @@ def gap(time: np.ndarray, at: np.ndarray) -> np.ndarray:
         at: `[m]` [s].
 
     Returns:
-        `[m]`; none of them where there are fewer than two rows.
+        `[m]`; of a single row all but its own time.
     """
     if len(time) < 2:
-        return np.zeros(np.shape(at), bool)
+        return ~np.isin(at, time)
     k = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
     away = np.minimum(np.abs(at - time[k - 1]), np.abs(at - time[k]))
     # Rows may come in bursts.
@@ -192,9 +192,7 @@ def check_marks(
         )
 
 
-def smooth(
-    time: np.ndarray, value: np.ndarray, at: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
+def smooth(time: np.ndarray, value: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Smoothing splines, as stiff as foretells every other row from the rest best (Woltring 1986).
 
     Args:
@@ -203,7 +201,7 @@ def smooth(
         at: `[m]` times [s].
 
     Returns:
-        `[m, d]` values, `[m, d]` rates, and the standard deviation of the noise.
+        `[m, d]` values and `[m, d]` rates.
     """
     known = np.isfinite(value).all(1)
     t, y = time[known], value[known]
@@ -212,7 +210,7 @@ def smooth(
         order = min(len(t) - 1, 2)
         lines = [np.polynomial.Polynomial.fit(t, column, order) for column in y.T]
         found = [np.stack([f(at) for f in g], -1) for g in (lines, [f.deriv() for f in lines])]
-        return found[0], found[1], float(np.std(np.diff(y, axis=0)) / np.sqrt(2))
+        return found[0], found[1]
     # Lengths from a frame to the whole, to the fourth power, as stiffness grows with length.
     usual = float(np.median(np.diff(t)))
     lengths = np.geomspace(usual, max(t[-1] - t[0], 4 * usual), 14)
@@ -226,10 +224,8 @@ def smooth(
             errors.append(float(np.mean((np.stack(foretold, -1) - y[1:-1:2]) ** 2)))
         best = 2 * stiffness[int(np.argmin(errors))]  # of twice as many rows
     splines = [make_smoothing_spline(t, column, lam=best) for column in y.T]
-    left = y - np.stack([f(t) for f in splines], -1)
     values = np.stack([f(at) for f in splines], -1)
-    rates = np.stack([f.derivative()(at) for f in splines], -1)
-    return values, rates, float(np.sqrt(np.mean(left**2) * 1.2) + 1e-9)
+    return values, np.stack([f.derivative()(at) for f in splines], -1)
 
 
 def rest_height(robot: Robot) -> float:

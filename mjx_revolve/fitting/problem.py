@@ -386,8 +386,9 @@ def make_problem(
         resets[: many * _PARTS : _PARTS, r] = True
         short[: 1 if whole else max(1, int(usual[r] / piece + 0.25)), r] = True
         if view.quat is not None:  # nor in a gap of it
-            seen = np.isfinite(view.quat).all(1) & np.isfinite(view.position[:, :2]).all(1)
-            lost = gap(view.time[seen], begin[r] + piece * np.arange(windows))
+            at = begin[r] + piece * np.arange(windows)
+            both = (np.isfinite(x).all(1) for x in (view.quat, view.position[:, :2]))
+            lost = np.any([gap(view.time[seen], at) for seen in both], 0)
             lost[0] = False
             resets[lost, r] = short[lost, r] = False
     at = begin + piece * np.arange(windows)[:, None]
@@ -580,7 +581,9 @@ class _View:
         wanted = [f"mark.{n}.{x}" for n in self.names for x in "xyz"]
         self.mark_time, seen = recording.table(wanted)
         self.seen = seen.reshape(len(self.mark_time), len(self.names), 3)
-        self.time, pose = recording.table(["x", "y", "z", "qw", "qx", "qy", "qz"])
+        own = ["yaw"] if "x" in signals and "qw" not in signals else []  # for its times
+        self.time, pose = recording.table(["x", "y", "z", "qw", "qx", "qy", "qz", *own])
+        pose = pose[:, :7]
         if self.names and "x" not in signals:  # an attitude beside marks is taken at their times
             self.time, pose = self.mark_time, _interpolate_pose(self.time, pose, self.mark_time)
         self.position, quat = pose[:, :3], pose[:, 3:]
@@ -595,7 +598,9 @@ class _View:
                 for n in ("yaw", "pitch", "roll")
             ]
             self.quat = Rotation.from_euler("ZYX", np.stack(turns, -1)).as_quat(scalar_first=True)
-            self.quat[gap(signals["yaw"].time, self.time)] = np.nan
+            read = signals["yaw"].time
+            none = ~np.isin(self.time, read) if "x" in signals else gap(read, self.time)
+            self.quat[none] = np.nan
             self.level = "roll" not in signals
         if self.quat is not None and not np.isfinite(self.quat).all(1).any():
             self.quat, self.level = None, False
@@ -687,17 +692,17 @@ class _View:
         spread = np.tile(_UNSEEN, (len(at), 1))
         axes = [k for k in range(3) if len(self.time) and np.isfinite(self.position[:, k]).any()]
         for k in axes:
-            value, rate, _ = smooth(self.time, self.position[:, k : k + 1], at)
+            value, rate = smooth(self.time, self.position[:, k : k + 1], at)
             found[:, k], found[:, 7 + k] = value[:, 0], rate[:, 0]
             spread[:, [k, 6 + k]] = _SEEN[[k, 6 + k]]
         if (depth := self.recording.signals.get("depth")) is not None and 2 not in axes:
-            value, rate, _ = smooth(depth.time, depth.value[:, None], at)
+            value, rate = smooth(depth.time, depth.value[:, None], at)
             found[:, 2], found[:, 9] = self.robot.world.surface_height - value[:, 0], -rate[:, 0]
             spread[:, [2, 8]] = _SEEN[[2, 8]]
         if self.quat is not None:
             known = np.isfinite(self.quat).all(1)
             q = self.quat[known] / np.linalg.norm(self.quat[known], axis=1, keepdims=True)
-            value, rate, _ = smooth(self.time[known], continuous_quaternions(q), at)
+            value, rate = smooth(self.time[known], continuous_quaternions(q), at)
             value /= np.linalg.norm(value, axis=1, keepdims=True)
             found[:, 3:7] = value
             w, v, dw, dv = value[:, :1], value[:, 1:], rate[:, :1], rate[:, 1:]

@@ -148,6 +148,8 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
             signals, unused = _read_csv(path, rest, robot)
         _add_marks(marks, signals, robot)
         notes += _check_signals(signals, robot)
+    if marks and "x" in signals:
+        notes.append(f"marks {', '.join(marks)} beside x and y of the core: not fitted")
     body = robot.morphology
     uncommanded = [*(body.modules[k].name for k in body.hinges), *body.thruster_names]
     uncommanded = [n for n in uncommanded if not {f"command.{n}", f"angle.{n}"} & set(signals)]
@@ -588,8 +590,7 @@ def _check_motion(signals: Mapping[str, TimeSeries], robot: Robot) -> None:
                 "world.surface_height=HEIGHT)?"
             )
     places = {n: s for n, s in signals.items() if n in _PLACE or n.startswith("mark.")}
-    level = [s for name, s in places.items() if name != "z"]
-    still = "mean_speed" not in signals and any(len(s.time) > 2 for s in level)
+    still = "mean_speed" not in signals and any(len(s.time) > 2 for s in places.values())
     for name, signal in places.items():
         if len(signal.time) < 3:
             continue
@@ -602,11 +603,9 @@ def _check_motion(signals: Mapping[str, TimeSeries], robot: Robot) -> None:
                 "column that ends in _mm)"
             )
         _check_jump(name, signal, length)
-        if name == "z":
-            continue
         jitter = float(np.median(np.abs(np.diff(signal.value, 2)))) / 2
         still = still and float(np.ptp(signal.value)) < max(12 * jitter, 2e-3 * length)
-    for name in ("yaw", "qz", "qx"):
+    for name in ("yaw", "pitch", "roll", "qx", "qy", "qz"):
         if name in signals and np.ptp(signals[name].value) > 0.1:
             still = False
     if still:
