@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.engine.plant import Plant
+from mjx_revolve.inputs.errors import InputError
 
 # Angular frequencies nearer than this, as a share of the fastest, count as equal; a choice.
 _SAME_RATE = 1e-5
@@ -41,7 +42,8 @@ def describe_gait(plant: Plant, settings: Any, genes: ArrayLike) -> dict[str, fl
 
     Args:
         plant: of one robot, from `plant_of`.
-        settings: a `config.ControllerConfig`.
+        settings: a `config.ControllerConfig`, with the robot's own sensors if those are what the
+            controller reads.
         genes: `[num_genes]` of one individual.
 
     Returns:
@@ -55,6 +57,9 @@ def describe_gait(plant: Plant, settings: Any, genes: ArrayLike) -> dict[str, fl
     if not plant.num_hinges:
         return still
     controller = find_controller(plant, settings.model_copy(update={"rate": None}))
+    if np.shape(genes) != (controller.num_genes,):
+        own = f"[{controller.num_genes}] of a {settings.type} with the sensors of its settings"
+        raise InputError("genes", own, list(np.shape(genes)))
     parameters = controller.decode(jnp.asarray(genes, float)[:, None], plant)
     rate, amplitude, phase = _WAVES[settings.type](parameters, plant.num_hinge_rows)
     moves = (amplitude > 1e-9) & (rate > 1e-9)
@@ -119,9 +124,10 @@ def _sensory_waves(parameters: Any, hinges: int) -> _Waves:
     for j in near[0]:
         cosine, sine = (np.asarray(columns[j], float)[:, 0] for columns in near)
         lag[:, j] = cosine - 1j * sine
-    phase = np.zeros(hinges)
-    for _ in range(2000):
-        phase += 0.02 * np.imag(np.exp(-1j * phase) * (lag @ np.exp(1j * phase)))
+    # In steps that are stable with so many neighbours, for the square of a chain's length.
+    phase, step = np.zeros(hinges), 0.5 / max(1, int((lag != 0).sum(0).max(initial=0)))
+    for _ in range(max(2000, 20 * hinges**2)):
+        phase += step * np.imag(np.exp(-1j * phase) * (lag @ np.exp(1j * phase)))
     sizes = np.asarray(size, float)[:, 0] * np.asarray(reach, float)[:hinges, 0]
     phase = phase + np.pi * (sizes < 0)
     return np.full(hinges, np.asarray(rate, float).item()), np.abs(sizes), phase

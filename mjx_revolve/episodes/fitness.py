@@ -187,7 +187,7 @@ class Fitness(EpisodeSpec[tuple[()]]):
             jnp.zeros((0, self.num_records)) if command is None else jnp.asarray(command)[rows].T,
             jnp.asarray(trajectory.power * dt).reshape(-1, every).sum(1)[:, None],
             jax.tree.map(lambda x: jnp.broadcast_to(x, (steps,))[rows], water),
-            self.start_point(self.geometry, self.draw_starts(key))[2, :1],
+            self.start_point(self.geometry, self.draw_starts(key))[:, :1],
             jax.tree.map(lambda x: jnp.asarray(x)[..., None], self.context(key)),
             self.variation(key),
             None if trajectory.target is None else jnp.asarray(trajectory.target)[rows],
@@ -200,7 +200,7 @@ class Fitness(EpisodeSpec[tuple[()]]):
 
         def run(
             qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array, command: jax.Array,
-            energy: jax.Array, water: Water, height: jax.Array,
+            energy: jax.Array, water: Water, start: jax.Array,
             context: EpisodeContext, variation: Variation | None, target: PyTree,
         ) -> PyTree:  # fmt: skip
             # The rows of the episode are the lanes, like a population.
@@ -214,7 +214,8 @@ class Fitness(EpisodeSpec[tuple[()]]):
             track = {name: jnp.moveaxis(x, -1, 0)[..., None] for name, x in rows.items()}
             if context.pursuit is not None:
                 track["target"] = target[..., None]
-            return self.judge_track(track | {"energy": energy}, height, self.geometry, context)
+            found = self.score(track | {"energy": energy}, start, self.geometry, context)
+            return jnp.where(found.sane, found.score, jnp.nan), found.measures
 
         return jax.jit(run)
 

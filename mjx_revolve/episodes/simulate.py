@@ -222,9 +222,10 @@ def simulate(
         for leaf in jax.tree.leaves(water):
             if leaf.ndim > 1 or (leaf.ndim == 1 and leaf.shape[0] not in (1, steps)):
                 raise InputError("water", f"numbers or [{steps}]", list(leaf.shape))
-    if context is None:
+    context = EpisodeContext() if context is None else context
+    if context.noise is None:
         noise = noise_key(jax.random.key(0) if key is None else key)
-        context = EpisodeContext(noise=jax.random.bits(noise, (), "uint32"))
+        context = context._replace(noise=jax.random.bits(noise, (), "uint32"))
     context = jax.tree.map(jnp.asarray, context)
     if variation is not None:
         if engine != "population":

@@ -232,14 +232,17 @@ def directed_swim(track: Track, settings: TaskConfig) -> jax.Array:
 def speed(track: Track, settings: TaskConfig) -> jax.Array:
     """Net horizontal speed through the water while the robot keeps its depth [body lengths/s].
 
-    In any direction; drift with a current does not count. With a `horizon`, net over that time, if
-    the motion is continued: see `_foretold`.
+    In any direction; drift with a current does not count, and what is lost counts at any depth.
+    With a `horizon`, net over that time, if the motion is continued: see `_foretold`.
     """
     moved = moved_through_water(track)[:, :2]
     if settings.horizon is not None:
         return safe_norm(tuple(_foretold(track, settings, moved)[1]))
-    counted = moved * _keeps_depth(track, settings)[:, None]
-    return safe_norm(tuple(jnp.sum(counted, 0))) / (track.duration * track.length)
+    # Along the way that is made at its depth: a loop whose lower half is off it goes nowhere.
+    keeps = _keeps_depth(track, settings)
+    net = jnp.sum(moved * keeps[:, None], 0)
+    along = jnp.sum(moved * net, 1) / jnp.maximum(safe_norm(tuple(net)), 1e-9)
+    return jnp.maximum(_progress(track, along, along * keeps), 0.0)
 
 
 def _foretold(track: Track, settings: Any, moved: jax.Array) -> tuple[jax.Array, jax.Array]:
