@@ -136,6 +136,7 @@ SETTINGS = SimpleNamespace(
         ("speed", track([0, -1, -2]), 2.0),
         ("speed", track([0, 1, 2], drift=1.0), 0.0),  # it drifted
         ("speed", track([0, 0, 0], drift=0.5), 1.0),  # it held its own
+        ("speed", track([0, 1, 0], z=[0, 0, 2]), 0.0),  # a loop whose way back is off its depth
         ("reach_target", track([0, 1, 3]), 6.0),  # from 4 m away to 1 m
         ("hold_depth", track([0, 1], z=[0.5, 0.5]), -1.0),
         ("hold_heading", turned([0, 0]), -1.0),  # off its depth alone

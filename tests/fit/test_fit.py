@@ -206,6 +206,13 @@ def test_a_sensor_of_what_is_held_out_alone_inflates_nothing(auv, signals):
     problem = make_problem(auv, given, ["drag"], FitSettings())
     left = linearize(problem, problem.origin()).values
     assert correlation(problem, left)["depth"] == 1.0
+    # Rows of another sensor between them take nothing from what errs together in time.
+    late = {n: TimeSeries(x.time + 1e-3 * (n[0] == "q"), x.value) for n, x in seen.items()}
+    pair = [
+        make_problem(auv, [RobotRecording("a", x)], ["drag"], FitSettings()) for x in (seen, late)
+    ]
+    one, other = (correlation(x, linearize(x, x.origin()).values)["position"] for x in pair)
+    assert other == pytest.approx(one, rel=0.05) and one > 3
 
 
 def test_an_attitude_beside_one_mark_counts(auv):

@@ -203,7 +203,7 @@ def test_joints_of_a_bag_of_ours_are_the_modules(tmp_path):
 def test_thrusters_of_a_bag_have_the_commands_before_their_lag(auv, tmp_path):
     pytest.importorskip("rosbags", reason="the package rosbags writes bags")
     time, count = 0.05 * np.arange(1, 41), auv.mj_model.nu
-    qpos = np.c_[0.1 * time, np.tile([0.0, -1, 1, 0, 0, 0], (40, 1))]
+    qpos = np.c_[np.zeros((40, 2)), -0.1 * time, np.tile([1.0, 0, 0, 0], (40, 1))]  # heave
     ctrl = np.linspace(0.1, 0.4, count) * np.ones((40, 1))
     none = np.zeros((40, 6)), np.zeros((40, 3, 3))
     swum = Trajectory(time, qpos, *none, ctrl, np.zeros(40), command=0.5 * ctrl)
