@@ -278,7 +278,7 @@ def swimmer(folder: Path, robot: str, task: dict[str, Any]) -> dict[str, Any]:
     """What `make_fitness` takes: a robot, written to a folder, that hovers in the lake; sines."""
     return {
         "morphology": str(write(folder, robot)),
-        "world": "lake",
+        "world": {"name": "lake", "bed": False},  # out of reach, and a replay would compile it
         "trim": "neutral",
         "controller": {"type": "sine"},
         "task": task,
@@ -290,14 +290,10 @@ def make_track(position: Any, interval: float = 1.0, **more: Any) -> Track:
     ones = np.ones(len(position))
     lanes = {"position": position, "clearance": ones, "energy": ones} | more
     return Track(
-        interval=interval,
-        start_height=jnp.zeros(1),
-        length=0.5,
-        weight=2.0,
-        surface_height=3.0,
+        interval=interval, start_height=jnp.zeros(1), length=0.5, weight=2.0, surface_height=3.0,
         num_hinges=np.shape(more["angle"])[1] if "angle" in more else 0,
         **{name: jnp.asarray(np.asarray(x, np.float32)[..., None]) for name, x in lanes.items()},
-    )
+    )  # fmt: skip
 
 
 def check_slope_at_rest(controller: Controller, plant: Plant, sense: SensorReadings) -> None:

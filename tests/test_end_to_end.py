@@ -18,8 +18,9 @@ from toys import CLOCK
 
 
 def command(name, *arguments, check=True):
+    program = ("-c", UNDRAWN) if name == "evolve undrawn" else ("-m", f"mjx_revolve.{name}")
     run = subprocess.run(
-        [sys.executable, "-m", f"mjx_revolve.{name}", *map(str, arguments)],
+        [sys.executable, *program, *map(str, arguments)],
         cwd=ROOT,
         env=os.environ | XLA_FLAGS,
         capture_output=True,
@@ -29,6 +30,17 @@ def command(name, *arguments, check=True):
     if check:
         assert run.returncode == 0, run.stderr
     return run
+
+
+# The command without its pictures, which the shipped run has drawn.
+UNDRAWN = """
+import sys
+from mjx_revolve import evolve
+from mjx_revolve.inputs.commands import run_command
+
+evolve._save_pictures = lambda *_: None
+sys.exit(run_command(evolve.main))
+"""
 
 
 def metrics(folder):
@@ -69,7 +81,7 @@ def test_a_killed_run_resumed_equals_one_never_stopped(smoke, tmp_path):
     shutil.rmtree(killed / "champion")
     (killed / "checkpoints" / "generation_000003.npz").unlink()
     RunFolder(killed).update_info(finished=None, champion=None)
-    assert "resuming" in command("evolve", "--resume", killed).stdout
+    assert "resuming" in command("evolve undrawn", "--resume", killed).stdout
     assert metrics(killed) == metrics(smoke)
     np.testing.assert_array_equal(load_genes(killed), load_genes(smoke))
 

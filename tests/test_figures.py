@@ -14,15 +14,11 @@ spec.loader.exec_module(figures)
 
 RESULTS = {
     "swim": {
-        "date": "2026-11-23",
-        "score": 0.15358,
-        "seconds": 375.0,
-        "none": None,
-        "interval": {"mean": 0.4, "half": 0.1, "text": "0.40 ± 0.10"},
-        "words": ["- one", "- two"],
+        "date": "2026-11-23", "score": 0.15358, "seconds": 375.0, "none": None,
+        "interval": {"mean": 0.4, "half": 0.1, "text": "0.40 ± 0.10"}, "words": ["- one", "- two"],
         "rows": [{"name": "spider", "speed": 1.5e6}, {"name": "snake", "speed": 2.25e6}],
     }
-}
+}  # fmt: skip
 
 
 def fill(text):

@@ -125,6 +125,7 @@ def test_champions_are_judged_at_rest_and_over_the_horizon(tmp_path, started, mo
     )
     assert study(tmp_path, "--only", "shore", "--generations", "2", "--seeds", "2") == 0
     assert made[-2:] == [(12, 60), (60, None)]
+    assert len(found) == 2
     for outcome in found:
         genes = RunReader(outcome.plan.folder).load_champion().genes
         hinges = -((outcome.champion["num_hinges"] - 3) ** 2)

@@ -89,16 +89,10 @@ def test_the_fin_is_a_plate_of_abs_with_lift():
 
 def test_ballast_moves_the_centres_of_mass_and_volume():
     part = Part(
-        "p",
-        (Box((0.1, 0.1, 0.1)),),
-        mass=0.3,
-        volume=2e-4,
-        electronics_volume=1e-4,
-        center_of_volume=(0.0, 0.01, 0.02),
-        ballast_mass=0.1,
-        ballast_volume=1e-4,
+        "p", (Box((0.1, 0.1, 0.1)),), mass=0.3, volume=2e-4, electronics_volume=1e-4,
+        center_of_volume=(0.0, 0.01, 0.02), ballast_mass=0.1, ballast_volume=1e-4,
         ballast_position=(0.04, 0.0, -0.04),
-    )
+    )  # fmt: skip
     assert part.total_mass == pytest.approx(0.4)
     assert part.total_volume == pytest.approx(4e-4)
     assert part.free_volume == pytest.approx(6e-4)

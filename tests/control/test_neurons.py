@@ -167,12 +167,8 @@ def test_what_a_file_may_have_for_a_brain(robot):
     ):  # fmt: skip
         check_refused(message, find, brain)
     check_refused(
-        "run.yaml: controller.points: expected 8, as the brain of ",
-        find_controller,
-        plant,
-        settings,
-        "run.yaml",
-        body=read(ROBOT),
-    )
+        "run.yaml: controller.points: expected 8, as the brain of ", find_controller, plant,
+        settings, "run.yaml", body=read(ROBOT),
+    )  # fmt: skip
     with pytest.raises(InputError, match=r"run.yaml: controller.type: expected another one, as"):
         find_controller(plant, settings, "run.yaml")

@@ -82,16 +82,11 @@ def expected(sensors, name):
     seen = lambda x: np.einsum("lij,li->lj", axes, x)  # noqa: E731
     water = np.array([[0.3, 0.5 * (1 + z / 20), 0.0] for z in place[:, 2]])
     return {
-        "up": axes[:, 2],
-        "north": axes[:, 0],
-        "angular_velocity": of("gyro"),
-        "flow": seen(water) - of("velocimeter"),
-        "target": seen(TARGET - place),
-        "force": of("accelerometer"),
-        "height": place[:, 2],
-        "climb": velocity[:, 2],
+        "up": axes[:, 2], "north": axes[:, 0], "angular_velocity": of("gyro"),
+        "flow": seen(water) - of("velocimeter"), "target": seen(TARGET - place),
+        "force": of("accelerometer"), "height": place[:, 2], "climb": velocity[:, 2],
         "altitude": of("rangefinder")[:, 0],
-    }
+    }  # fmt: skip
 
 
 # Rounding alone, but for the specific force: it is the mean over a step, half a step old. In

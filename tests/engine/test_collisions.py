@@ -310,7 +310,7 @@ def test_jointed_robots_meet_fast_and_lose_energy():
     """Spiders, fish and snakes at 2 m/s: none through another, no energy made. Forces are equal
     and opposite; what is left of momentum is the step's own, of hinges that whip."""
     dt, names = 0.0125, ("spider", "fish", "snake", "spider", "spider", "spider")
-    space = world(timestep=dt)
+    space = world(timestep=dt, self_contact=False)
     robots = [build_robot(body(name), space) for name in names]
     run = make_run(space, robots, 3, round(0.6 / dt), 1)
     qpos = np.zeros((7 + fit_capacity(robots).hinges, 6))

@@ -92,7 +92,7 @@ def test_hinges_that_reverse_together_do_not_push_each_other_far_beyond_the_top_
     What others push on is no motor's doing: so it is in steps of 0.3 ms, too, to 1.85 times the
     top speed. Where motors went on pushing it was 2.9 (12.5 ms) and 3.5 times (5 ms).
     """
-    waters = load_world("lake", bed=False, timestep=dt)
+    waters = load_world("lake", bed=False, self_contact=False, timestep=dt)
     kinds = [(18, 6), (38, 5), (47, 7), (19, 7)]
     robots = [
         build_robot(trim_neutral(random_body(s, n, (s // 7) % 5), waters.density), waters)

@@ -206,12 +206,9 @@ def winged(switch, tank):
 
 
 SWITCHES = {
-    "none": "",
-    "buoyancy": 'buoyancy: "off"',
-    "mask": "buoyancy: mask",
-    "drag": 'drag: "off"',
+    "none": "", "buoyancy": 'buoyancy: "off"', "mask": "buoyancy: mask", "drag": 'drag: "off"',
     "added_mass": "added_mass: false",
-}
+}  # fmt: skip
 
 
 @lru_cache
@@ -267,14 +264,9 @@ def test_ballast_in_the_keel_rights_a_body():
     tank = world(gravity=G, buoyancy="partial", added_mass=True)
     mass = hull + lead
     robot = box_robot(
-        size,
-        hull,
-        tank,
-        mass / RHO,
-        center_of_volume=(0, 0, high),
-        ballast_mass=lead,
+        size, hull, tank, mass / RHO, center_of_volume=(0, 0, high), ballast_mass=lead,
         ballast_position=(0, 0, low),
-    )
+    )  # fmt: skip
     z = lead * low / mass
     added, turning = box_added_mass(np.array(size) / 2)
     for axis, edges, sideways in ((0, (0.1, 0.06), 1), (1, (0.2, 0.06), 0)):
@@ -299,24 +291,18 @@ def check_slope(robot, *cases, kinks=(), compiled=QUICK):
     def end(inputs):
         qpos = jnp.asarray(robot.qpos0).at[:3].set(inputs["place"]).at[3:7].set(inputs["quat"])
         trajectory = simulate(
-            robot,
-            jnp.broadcast_to(inputs["ctrl"], (steps, robot.mj_model.nu)),
-            qpos=qpos,
-            qvel=inputs["qvel"],
-            water=Water(0.0, tuple(inputs["current"]), time=inputs["time"]),
-        )
+            robot, jnp.broadcast_to(inputs["ctrl"], (steps, robot.mj_model.nu)), qpos=qpos,
+            qvel=inputs["qvel"], water=Water(0.0, tuple(inputs["current"]), time=inputs["time"]),
+        )  # fmt: skip
         # Weights, so that no slope vanishes by symmetry alone.
         weights = jnp.arange(1, robot.mj_model.nq + 1) / 10
         return jnp.sum(weights * trajectory.qpos[-1]) + trajectory.qvel[-1] @ weights[:-1]
 
     usual = {
-        "place": np.array([0.0, 0.0, -2.0]),
-        "quat": np.array([1.0, 0.0, 0.0, 0.0]),
-        "ctrl": np.zeros(robot.mj_model.nu),
-        "qvel": np.zeros(robot.mj_model.nv),
-        "current": np.zeros(3),
-        "time": 0.0,
-    }
+        "place": np.array([0.0, 0.0, -2.0]), "quat": np.array([1.0, 0.0, 0.0, 0.0]),
+        "ctrl": np.zeros(robot.mj_model.nu), "qvel": np.zeros(robot.mj_model.nv),
+        "current": np.zeros(3), "time": 0.0,
+    }  # fmt: skip
     value = jax.jit(end, compiler_options=compiled)
     slope = jax.jit(jax.grad(end), compiler_options=SLOPE)
     for case in kinks:
@@ -367,12 +353,9 @@ def test_gradient_in_waves_and_in_contact():
         bed=Bed(kind="flat", height=-6.0),
     )
     afloat = {
-        "place": np.array([0.2, 0.1, 0.02]),
-        "quat": np.array([1.0, 0.02, -0.03, 0.1]),
-        "qvel": np.full(6, 0.1),
-        "current": np.array([0.05, 0.02, 0.01]),
-        "time": 0.3,
-    }
+        "place": np.array([0.2, 0.1, 0.02]), "quat": np.array([1.0, 0.02, -0.03, 0.1]),
+        "qvel": np.full(6, 0.1), "current": np.array([0.05, 0.02, 0.01]), "time": 0.3,
+    }  # fmt: skip
     sliding = {
         "place": np.array([0.0, 0.0, -6.0 + 0.0215]),
         "qvel": np.array([0.1, 0.05, -0.02, 0.1, 0.05, 0.2]),

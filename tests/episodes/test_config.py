@@ -98,13 +98,9 @@ def test_the_kinds_are_those_there_are():
 
 def test_settings_are_yaml(folder):
     settings = [
-        "task.duration=20",
-        "task.energy_weight=1e-3",
-        "task.direction=[0, 1, 0]",
-        "task.target=null",
-        "evolution.strategy_params.std_min=0.1",
-        "world.current=[0.1, 0, 0]",
-    ]
+        "task.duration=20", "task.energy_weight=1e-3", "task.direction=[0, 1, 0]",
+        "task.target=null", "evolution.strategy_params.std_min=0.1", "world.current=[0.1, 0, 0]",
+    ]  # fmt: skip
     config = load_config(folder / "good.yaml", settings)
     assert config.task.duration == 20.0
     assert config.task.energy_weight == 1e-3

@@ -87,7 +87,7 @@ def test_scores_have_a_gradient_where_nothing_is_left(name):
 
 CHASED = {
     "task.duration": 2.0, "task.settle": 0.2, "task.trials": 2, "task.target_distance": 0.4,
-    "task.target_turn": 1.0,
+    "task.target_turn": 1.0, "world.bed": False,
 }  # fmt: skip
 pytestmark = pytest.mark.usefixtures("quick_compiles")
 

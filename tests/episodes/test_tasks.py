@@ -53,7 +53,7 @@ def settings(tmp_path_factory):
     def make(name, **more):
         return {
             "morphology": str(folder / "core.yaml"),
-            "world": {"name": "lake", **more.pop("world", {})},
+            "world": {"name": "lake", "bed": False, **more.pop("world", {})},
             "controller": {"type": "sine"},
             "task": task | {"type": f"{folder / 'own.py'}:{name}"},
         } | more

@@ -78,12 +78,9 @@ def replay(fitness, actions, every, seed, episode=0):
     own[:, actuators_of(fitness.robot)] = actions
     ctrl = np.repeat((low + high) / 2 + (high - low) / 2 * own, every, 0)
     return simulate(
-        fitness.robot,
-        ctrl,
-        qpos=fitness.starts(key)[0][:, 0],
-        water=fitness.water(key),
+        fitness.robot, ctrl, qpos=fitness.starts(key)[0][:, 0], water=fitness.water(key),
         context=fitness.context(key),
-    ), key
+    ), key  # fmt: skip
 
 
 @pytest.mark.slow

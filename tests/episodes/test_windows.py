@@ -14,13 +14,9 @@ from mjx_revolve.episodes.windows import make_windows
 
 KEY = jax.random.key(3)
 TASK = {
-    "type": "directed_swim",
-    "duration": 0.6,
-    "settle": 0.2,
-    "trials": 2,
-    "energy_weight": 0.5,
+    "type": "directed_swim", "duration": 0.6, "settle": 0.2, "trials": 2, "energy_weight": 0.5,
     "start_yaw": 1.0,
-}
+}  # fmt: skip
 # Noise follows from the episode's number, so it is the same on both sides of a difference.
 SENSORS = ["tilt", {"type": "gyro", "noise": 0.1}, "depth", {"type": "angle", "noise": 0.05},
            "load", "battery", "accelerometer"]  # fmt: skip

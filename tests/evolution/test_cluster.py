@@ -121,6 +121,7 @@ def test_a_sweep_has_the_workers_of_a_cluster(cluster, tmp_path, monkeypatch):
         assert tables[0] == tables[1]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", ["kill", "hang", "raise"])
 def test_a_lost_worker_costs_nothing(cluster, executor, kind, caplog):
     before = {*executor.workers}

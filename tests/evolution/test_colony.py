@@ -241,10 +241,10 @@ def test_births_and_deaths_add_up(history, config):
 @pytest.mark.slow
 def test_it_goes_on_from_any_checkpoint_bit_for_bit(history, config):
     found, evolution = history
-    again = evolution.from_arrays(evolution.to_arrays(found[4][0]))
+    again = evolution.from_arrays(evolution.to_arrays(found[1][0]))
     rest = list(run_generations(evolution, config.evolution.generations, again))
-    assert len(rest) == len(found) - 5
-    for (one, row), (other, same) in zip(found[5:], rest, strict=True):
+    assert len(rest) == len(found) - 2
+    for (one, row), (other, same) in zip(found[2:], rest, strict=True):
         assert json.dumps(one.events) == json.dumps(other.events)
         for name in row:
             if name not in ("seconds", "times_real_time", "evaluations_per_second"):

@@ -9,11 +9,9 @@ import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
-import jax
 import numpy as np
 import pytest
 import yaml
-from jax.experimental.compilation_cache import compilation_cache
 
 from laboratory import body
 from mjx_revolve.body.catalogue import load_modules
@@ -388,26 +386,3 @@ def test_champion_genes_come_back_bit_for_bit(run):
         (run.path / "champion" / "genes.yaml").write_text(f"genes: [0.5, {huge}]")
         with pytest.raises(InputError, match=r"genes.1: expected a number.*; found .{1,60}$"):
             load_genes(run.path)
-
-
-@pytest.mark.filterwarnings("ignore:Error reading persistent compilation cache")
-def test_a_damaged_cache_entry_costs_only_time(tmp_path):
-    before = {
-        name: getattr(jax.config, name)
-        for name in ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs",
-                     "jax_persistent_cache_min_entry_size_bytes")
-    }  # fmt: skip
-    compilation_cache.reset_cache()
-    try:
-        for name, value in zip(before, (str(tmp_path), 0.0, 0), strict=True):
-            jax.config.update(name, value)
-        for damage in (None, lambda data: data[: len(data) // 2], lambda data: flip(data, 90)):
-            for entry in tmp_path.glob("*-cache") if damage else ():
-                entry.write_bytes(damage(entry.read_bytes()))
-            jax.clear_caches()
-            assert jax.jit(lambda x: jax.numpy.sin(x) * 3 + 1)(0.0) == 1.0
-            assert list(tmp_path.glob("*-cache"))
-    finally:
-        for name, value in before.items():
-            jax.config.update(name, value)
-        compilation_cache.reset_cache()

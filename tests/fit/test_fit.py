@@ -631,7 +631,8 @@ def test_a_fit_goes_on_in_the_water_that_it_had(signals, tmp_path, monkeypatch, 
 def test_a_fit_that_was_stopped_goes_on_bit_for_bit(signals, tmp_path):
     robot, entry, copies = load_robot("auv", None, None, {"bed": "off"}, False)
     recording = make_noisy(signals, seed=2, name="pool")
-    request = Request(robot, (recording,), tuple(FREE), FitSettings(), 0, (entry, copies))
+    settings = FitSettings(iterations=4, duration=2.0)  # the latter of motions that it advises
+    request = Request(robot, (recording,), tuple(FREE), settings, 0, (entry, copies))
     whole = FitRun.begin(tmp_path / "whole", request)
     found = whole.run(Stop(10**6))
     whole.write(found, "page")

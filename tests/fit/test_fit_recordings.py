@@ -23,7 +23,9 @@ from mjx_revolve.water.world import load_world
 FREE = ["drag", "thrust"]
 TRUE = [1.3, 0.8]
 POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
-SETTINGS = ["--free", "drag,thrust", "--set", "window=3", "--set", "held_out=0"]
+SETTINGS = [
+    "--free", "drag,thrust", "--set", "window=3", "--set", "held_out=0", "--set", "duration=2",
+]  # fmt: skip
 MARKS = {"bow": np.array([0.0, 0.1, 0.0]), "stern": np.array([0.0, -0.1, 0.0]),
          "top": np.array([0.03, 0.0, 0.05])}  # fmt: skip
 

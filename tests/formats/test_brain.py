@@ -330,12 +330,9 @@ def test_whole_numbers_and_truth_values(tmp_path, spider):
 
     zero = jnp.zeros((8, 1))
     begin = (
-        jnp.zeros(1, jnp.int32),
-        jnp.ones(1, bool),
-        zero + 0.1,
-        zero - 0.2,
+        jnp.zeros(1, jnp.int32), jnp.ones(1, bool), zero + 0.1, zero - 0.2,
         *(zero for _ in range(6)),
-    )
+    )  # fmt: skip
     controller = Controller(0, (), lambda genes, plant: (), lambda parameters: begin, step)
     brain = make_brain(spider, controller, np.zeros(0), 20.0)
     draw, rows, expected = np.random.default_rng(1), [], []

@@ -186,12 +186,9 @@ def test_a_thruster_along_a_diagonal_has_a_propeller():
 
 def test_sdf_of_a_world_without_water_has_none_and_its_bed_is_there():
     world = load_world(
-        "empty_underwater",
-        buoyancy="off",
-        drag="off",
-        added_mass=False,
+        "empty_underwater", buoyancy="off", drag="off", added_mass=False,
         bed={"kind": "flat", "height": -1.5, "friction": 0.7},
-    )
+    )  # fmt: skip
     root, _ = model_of(build_robot(body("core"), world))
     text = ElementTree.tostring(root, encoding="unicode")
     for word in ("Hydrodynamics", "Buoyancy", "fluid_added_mass"):

@@ -41,16 +41,10 @@ def test_a_network_worked_by_hand():
         num_outputs=2,
         nodes=(Node(7, "abs"), Node(9, "sin"), Node(8, "gauss")),
         links=edges(
-            (-1, 9, 3.0),
-            (-2, 9, -1.0),
-            (9, 0, 2.0),
-            (-2, 0, -1.0),
-            (-2, 7, 1.0),
-            (7, 8, 1.0),
-            (8, 1, 1.0),
-            (-3, 1, 5.0),
+            (-1, 9, 3.0), (-2, 9, -1.0), (9, 0, 2.0), (-2, 0, -1.0), (-2, 7, 1.0), (7, 8, 1.0),
+            (8, 1, 1.0), (-3, 1, 5.0),
         ),
-    )
+    )  # fmt: skip
     points = [(0.0, 0.0), (0.3, -0.5), (-1.0, 2.0)]
     found = network.evaluate(np.array([(x, y, 1.0) for x, y in points]))
     assert found.shape == (3, 2)

@@ -63,20 +63,13 @@ class Tree:
 def test_values_become_plain():
     assert read(Integer, np.int64(3)) == 3 and read(Boolean, np.bool_(True)) is True
     tree = Tree(
-        "oak",
-        axis=np.array([0.0, 3.0, 4.0]),
-        place=[np.float32(1.5), 2, np.int64(3)],
-        leaves=[{"length": 1}, Leaf(2, range=[0, 1])],
-        first="off",
-        shade=False,
-    )
+        "oak", axis=np.array([0.0, 3.0, 4.0]), place=[np.float32(1.5), 2, np.int64(3)],
+        leaves=[{"length": 1}, Leaf(2, range=[0, 1])], first="off", shade=False,
+    )  # fmt: skip
     assert tree == Tree(
-        name="oak",
-        axis=(0.0, 0.6, 0.8),
-        place=(1.5, 2.0, 3.0),
-        leaves=(Leaf(1.0), Leaf(2.0, (0.0, 1.0))),
-        shade="off",
-    )
+        name="oak", axis=(0.0, 0.6, 0.8), place=(1.5, 2.0, 3.0),
+        leaves=(Leaf(1.0), Leaf(2.0, (0.0, 1.0))), shade="off",
+    )  # fmt: skip
     plain = [*tree.axis, *tree.place, tree.leaves[0].length]
     assert {type(x) for x in plain} == {float}
     assert read(Tree, {"name": "oak", "first": {"length": 3}}).first == Leaf(3)

@@ -24,15 +24,12 @@ from toys import COLONY
 NOWHERE = np.zeros(3)
 # Two founders; 2 and 3 are of the first one's family, 4 is a stranger. 0 and 3 die.
 EVENTS = [
-    Event(0.0, "birth", 0, np.array([1.0, 0, -1])),
-    Event(0.0, "birth", 1, NOWHERE),
-    Event(10.0, "mating", 0, NOWHERE, other=1),
-    Event(20.0, "birth", 2, NOWHERE, parents=(0, 1)),
+    Event(0.0, "birth", 0, np.array([1.0, 0, -1])), Event(0.0, "birth", 1, NOWHERE),
+    Event(10.0, "mating", 0, NOWHERE, other=1), Event(20.0, "birth", 2, NOWHERE, parents=(0, 1)),
     Event(30.0, "death", 0, NOWHERE, cause="age"),
-    Event(40.0, "birth", 3, NOWHERE, parents=(2, 1)),
-    Event(40.0, "birth", 4, NOWHERE),
+    Event(40.0, "birth", 3, NOWHERE, parents=(2, 1)), Event(40.0, "birth", 4, NOWHERE),
     Event(50.0, "death", 3, np.full(3, np.nan), cause="a new one"),
-]
+]  # fmt: skip
 
 
 @pytest.fixture

@@ -27,14 +27,10 @@ def states(robot: Robot, qpos, qvel=None, ctrl=None, command=None, time=None) ->
     count, model = len(qpos), robot.mj_model
     blank = lambda value, width: np.zeros((count, width)) if value is None else value  # noqa: E731
     return Trajectory(
-        time=np.zeros(count) if time is None else time,
-        qpos=qpos,
-        qvel=blank(qvel, model.nv),
-        xpos=np.zeros((count, model.nbody, 3)),
-        ctrl=blank(ctrl, model.nu),
-        power=np.zeros(count),
+        time=np.zeros(count) if time is None else time, qpos=qpos, qvel=blank(qvel, model.nv),
+        xpos=np.zeros((count, model.nbody, 3)), ctrl=blank(ctrl, model.nu), power=np.zeros(count),
         command=command,
-    )
+    )  # fmt: skip
 
 
 def pose(x=0.0, y=0.0, z=-5.0, quat=(1.0, 0.0, 0.0, 0.0)) -> np.ndarray:

@@ -19,6 +19,7 @@ from laboratory import body
 from mjx_revolve import live
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.shipped import list_shipped
 from mjx_revolve.view.live.commands import Current, Drop, Pause, Rate
 from mjx_revolve.view.live.page import live_page
 from mjx_revolve.view.live.robot_catalogue import load_catalogue
@@ -299,6 +300,18 @@ def test_the_stock_of_a_run(tmp_path):
     assert catalogue.mixed.capacity.hinges >= 8
 
 
+@pytest.fixture
+def few_shipped(monkeypatch):
+    """A stock of some shipped robots: all of them take seconds."""
+    few = ("bluerov2", "fish", "snake", "spider")
+
+    def listed(kind):
+        return {n: p for n, p in list_shipped(kind).items() if kind == "configs" or n in few}
+
+    monkeypatch.setattr("mjx_revolve.view.live.robot_catalogue.list_shipped", listed)
+
+
+@pytest.mark.usefixtures("few_shipped")
 def test_robots_that_float_or_are_too_light_do_not_hinder_others(tmp_path):
     (tmp_path / "sea.yaml").write_text("name: lake\ndensity: 1025\ntimestep: 0.0125\n"
                                        "drag: ellipsoid\n")  # fmt: skip
@@ -309,6 +322,7 @@ def test_robots_that_float_or_are_too_light_do_not_hinder_others(tmp_path):
     assert "fish" not in names  # its tail is too light for the step
 
 
+@pytest.mark.usefixtures("few_shipped")
 def test_ctrl_c_ends_it(monkeypatch, capsys):
     # Tests in the background ignore it.
     heard = signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -30,7 +30,7 @@ from mjx_revolve.view.statistics import interval
 SETTINGS = {
     "morphology": "elbow.yaml",
     "trim": "none",
-    "world": "lake",
+    "world": {"name": "lake", "bed": False},
     "controller": {"type": "cpg", "max_frequency": 1.0},
     "task": {"type": "speed", "duration": 1.0, "settle": 0.2, "trials": 1},
     "evolution": {"strategy": "SNES", "population_size": 8, "generations": 6},

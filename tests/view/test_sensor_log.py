@@ -15,15 +15,11 @@ from mjx_revolve.view.sensor_log import trace_sensors
 
 SENSORS = [
     {"type": "depth", "range": [0, 4], "noise": 0.05, "rate": 20, "delay": 0.06},
-    {"type": "accelerometer", "at": "upper", "range": 30},
-    {"type": "gyro", "noise": 0.1},
-    {"type": "battery", "range": [0, 1]},
-    {"type": "speed", "noise": 0.2},
-    {"type": "load", "delay": 0.02},
-    {"type": "flow", "each": "FixedBrick", "noise": 0.01},
-    {"type": "climb", "each": "Fin"},
-    {"type": "contact"},
-]
+    {"type": "accelerometer", "at": "upper", "range": 30}, {"type": "gyro", "noise": 0.1},
+    {"type": "battery", "range": [0, 1]}, {"type": "speed", "noise": 0.2},
+    {"type": "load", "delay": 0.02}, {"type": "flow", "each": "FixedBrick", "noise": 0.01},
+    {"type": "climb", "each": "Fin"}, {"type": "contact"},
+]  # fmt: skip
 KEY = jax.random.key(7)
 
 

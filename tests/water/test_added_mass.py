@@ -35,7 +35,6 @@ def test_ellipsoid_as_mujoco_has_it(semi):
 def test_a_box_is_the_ellipsoid_of_its_volume_and_proportions():
     half = np.array(SIZE) / 2
     semi = half * (6 / np.pi) ** (1 / 3)
-    assert 4 / 3 * np.pi * semi.prod() == pytest.approx(np.prod(SIZE))
     assert box_added_mass(half)[0] == pytest.approx(lamb_coefficients(semi)[0])
     cube, _ = box_added_mass(np.full(3, 0.5))
     assert cube == pytest.approx(0.5)

@@ -23,14 +23,11 @@ SIZE = np.array([0.2, 0.1, 0.06])  # [m]
 def chain_numbers(end=0.0, water=WATER):
     """Of a part in a slender row along x, with neighbours at both ends or at all but one."""
     parts = SimpleNamespace(
-        half_size=SIZE[None] / 2,
-        silhouette=(SIZE.prod() / SIZE)[None],
-        exposed=np.array([[abs(end) / 2, 1.0, 1.0]]),
-        joined=np.array([[1.0, 0.0, 0.0]]),
-        ends=np.array([[end, 0.0, 0.0]]),
-        rows=np.array([[2.0, 0.1, 0.06]]),
+        half_size=SIZE[None] / 2, silhouette=(SIZE.prod() / SIZE)[None],
+        exposed=np.array([[abs(end) / 2, 1.0, 1.0]]), joined=np.array([[1.0, 0.0, 0.0]]),
+        ends=np.array([[end, 0.0, 0.0]]), rows=np.array([[2.0, 0.1, 0.06]]),
         coefficients={"drag_coefficient": np.full((1, 3), 1.05), "friction": np.array([0.455])},
-    )
+    )  # fmt: skip
     numbers = CROSS_FLOW.numbers(parts, water)
     return as_components(jax.tree.map(lambda x: x[0], numbers))
 

@@ -244,14 +244,11 @@ def test_a_component_that_is_nowhere_costs_nothing():
 
 
 WORLDS = {
-    "waves": {"waves": SEA},
-    "shallow waves": {"waves": SEA, "water_depth": 1.5},
-    "linear": {"shear": Shear((1, 2, 0), 2.0)},
-    "power": {"shear": Shear((1, 2, 0), 2.0, "power")},
+    "waves": {"waves": SEA}, "shallow waves": {"waves": SEA, "water_depth": 1.5},
+    "linear": {"shear": Shear((1, 2, 0), 2.0)}, "power": {"shear": Shear((1, 2, 0), 2.0, "power")},
     "exponential": {"shear": Shear((1, 2, 0), 2.0, "exponential")},
-    "even": {"current_field": grid(EVEN)},
-    "uneven": {"current_field": grid(UNEVEN)},
-}
+    "even": {"current_field": grid(EVEN)}, "uneven": {"current_field": grid(UNEVEN)},
+}  # fmt: skip
 
 
 @pytest.mark.slow
@@ -289,7 +286,7 @@ def test_values_and_gradients_are_finite_and_of_the_inputs_type(name, x64):
 
 @pytest.mark.parametrize("name", WORLDS)
 def test_single_precision(name):
-    """Within 1e-4 of the largest velocity, acceleration and height after a quarter of an hour.
+    """Within 1e-3 of the largest velocity, acceleration and height after a quarter of an hour.
 
     Then the phase is some thousand radians, which float32 knows to 2e-4; in the beginning 1e-6.
     """

@@ -67,22 +67,13 @@ timestep: 2e-3
 """)
     water = load_world(path)
     assert water == World(
-        name="mars",
-        density=1025.0,
-        gravity=3.71,
-        current=(0.1, 0.0, -0.05),
-        drag="off",
-        buoyancy="mask",
-        added_mass=False,
-        bed=Bed(kind="lake", height=-4, highest=1.5, extent=40),
-        lift_drag=LiftDrag(cla=4.7),
-        shear=Shear((0.2, 0.0, 0.0), depth=3, profile="power"),
+        name="mars", density=1025.0, gravity=3.71, current=(0.1, 0.0, -0.05), drag="off",
+        buoyancy="mask", added_mass=False, bed=Bed(kind="lake", height=-4, highest=1.5, extent=40),
+        lift_drag=LiftDrag(cla=4.7), shear=Shear((0.2, 0.0, 0.0), depth=3, profile="power"),
         gust=Gust((0.05, 0.05, 0.0), time=4),
-        waves=(Wave(0.05, 2, direction=1.57), Wave(0.01, period=0.9, phase=-1)),
-        water_depth=4,
-        surface_tension=SurfaceTension(gamma=0.0728, contact_angle=0.0),
-        timestep=0.002,
-    )
+        waves=(Wave(0.05, 2, direction=1.57), Wave(0.01, period=0.9, phase=-1)), water_depth=4,
+        surface_tension=SurfaceTension(gamma=0.0728, contact_angle=0.0), timestep=0.002,
+    )  # fmt: skip
     assert load_world(str(path)) == water
     assert hash(load_world(path)) == hash(water)
     # A mapping keeps what it does not name; lists are replaced; each can be switched off.
