@@ -126,17 +126,15 @@ class LocalWorker:
         process: the process.
         channel: the pipe to it.
         core: the core it is pinned to; None: any.
-        begun: whether it imports what it needs, or has; it waits before.
         ready: whether it has opened the job.
         block: the number of the block that it scores; None: it is free.
         age: time spent on that block, as measured by the executor [s].
     """
 
     def __init__(self, core: int | None, cache: Path | None) -> None:
-        """Starts the process, which waits; OSError if the system refuses."""
+        """Starts the process, which waits for its job; OSError if the system refuses."""
         self.core = core
-        self._cache = cache
-        self.begun = self.ready = False
+        self.ready = False
         self.block: int | None = None
         self.age = 0.0
         # Appending, so that reading in between does not move the place of writing.
@@ -155,12 +153,7 @@ class LocalWorker:
             raise
         finally:
             theirs.close()
-
-    def begin(self) -> None:
-        """Lets it import what it needs, unless it does; then it waits for its job."""
-        if not self.begun:
-            self.begun = True
-            self.send((self.core, str(self._cache) if self._cache else None))
+        self.send((core, str(cache) if cache else None))
 
     def send(self, message: object) -> None:
         """Sends a message; the worker's death shows when its answer is read."""
@@ -194,9 +187,6 @@ class LocalWorker:
 def start_workers(count: int, cache: Path | None) -> list[LocalWorker]:
     """Starts workers, which import what they need and wait for a job.
 
-    One core is left for this process, which is about to import as much: workers beyond the others
-    begin when one is ready.
-
     Args:
         count: number of workers. If there is one for each core, each is pinned to a core; fewer are
             not pinned, so that several runs on one host do not share the same cores.
@@ -211,8 +201,6 @@ def start_workers(count: int, cache: Path | None) -> list[LocalWorker]:
     try:
         for index in range(count):
             workers.append(LocalWorker(cores[index % len(cores)] if pinned else None, cache))
-            if not pinned or index < max(1, len(cores) - 1):
-                workers[-1].begin()
     except BaseException as error:
         for worker in workers:
             worker.end()
@@ -258,19 +246,7 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
     def begin(self) -> None:
         """See `WorkerExecutor`."""
         for worker in self.workers:
-            if worker.begun:
-                self._open(worker)
-
-    def _open(self, worker: LocalWorker) -> None:
-        """Gives a worker its job."""
-        worker.begin()
-        worker.send((self.job, self._scratch.name))
-
-    def _open_waiting(self) -> None:
-        """Gives it to those that have waited."""
-        for worker in self.workers:
-            if not worker.begun:
-                self._open(worker)
+            worker.send((self.job, self._scratch.name))
 
     @property
     def num_workers(self) -> int:
@@ -294,7 +270,7 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
         waited = min(time.monotonic() - began, 2 * _TICK)
         news: list[tuple[int, Scored | str | None]] = []
         for worker in list(self.workers):
-            idle = not worker.begun or (worker.ready and worker.block is None)
+            idle = worker.ready and worker.block is None
             worker.age += 0.0 if idle else waited
             limits = self.job.limits
             limit = limits.timeout(self._times) if worker.ready else limits.ready
@@ -319,7 +295,6 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
         if message:
             self._dismiss(worker, message)
         worker.ready, self._false_starts = True, 0
-        self._open_waiting()
         return []
 
     def _replace(self, worker: LocalWorker, how: str) -> list[tuple[int, str]]:
@@ -335,7 +310,7 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
         except OSError as error:
             self._dismiss(worker, describe_error(error))
         else:
-            self._open(another)
+            another.send((self.job, self._scratch.name))
             self.workers[self.workers.index(worker)] = another
         return [] if worker.block is None else [(worker.block, how)]
 
@@ -346,7 +321,6 @@ class ProcessExecutor(WorkerExecutor[LocalWorker]):
         if not self.workers:
             raise WorkerError(f"no worker can be started ({why})")
         _log.warning("the run goes on with fewer workers, %d (%s)", len(self.workers), why)
-        self._open_waiting()
 
     def close(self) -> None:
         """Ends the workers."""
