@@ -212,7 +212,7 @@ def describe(fit: Fit) -> list[str]:
             f"{stuck}: at the bound, a factor of {LARGEST_FACTOR:g}: the robot, its units or its "
             "law is another one; trust no interval"
         )
-    elif not fit.state.finished:
+    if not fit.state.finished:
         lines.append("the search has not arrived: begin anew with more --set iterations")
     if fit.advice:
         lines.append(f"the most informative motion: {fit.advice}")

@@ -166,10 +166,7 @@ class ControllerConfig(Section):
         self.refuse_params(self.params)
         times = self.harmonics if self.type == "sine" else 1
         slow = self.rate is not None and times * self.max_frequency > self.rate / 2
-        # A brain of neurons has no frequencies, and leaves them as they are.
-        usual = type(self).model_fields["max_frequency"].default
-        free = self.type == "brain" and self.max_frequency == usual
-        if slow and not free and self.type != "feedback" and not self.is_user_code:
+        if slow and self.type not in ("feedback", "brain") and not self.is_user_code:
             most = f"at most half of controller.rate ({self.rate:g} Hz), to be sampled by it"
             most += f", of the last of {times} harmonics" if times > 1 else ""
             raise ConstraintError("max_frequency", most, f"{self.max_frequency:g}")

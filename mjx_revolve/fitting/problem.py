@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Annotated, Any, NamedTuple
@@ -381,14 +381,14 @@ def make_problem(
     short = resets.copy()
     for r, view in enumerate(views):
         # Without attitude, nothing says how to begin again.
-        whole = held[r] or view.quat is None
+        whole = held[r] or view.quat is None or not np.isfinite(view.position).any()
         many = 1 if whole else max(1, int(usual[r] / piece / _PARTS + 0.25))
         resets[: many * _PARTS : _PARTS, r] = True
         short[: 1 if whole else max(1, int(usual[r] / piece + 0.25)), r] = True
         if view.quat is not None:  # nor in a gap of it
             at = begin[r] + piece * np.arange(windows)
-            both = (np.isfinite(x).all(1) for x in (view.quat, view.position[:, :2]))
-            lost = np.any([gap(view.time[seen], at) for seen in both], 0)
+            known = [np.isfinite(x) for x in (view.quat[:, 0], *view.position.T[:2])]
+            lost = np.any([gap(view.time[one], at) for one in known if one.any()], 0)
             lost[0] = False
             resets[lost, r] = short[lost, r] = False
     at = begin + piece * np.arange(windows)[:, None]
@@ -537,8 +537,12 @@ def _held(
 
 
 _SENT = ("command.", "angle.")
-# What is interpolated, from rows before the first frame on, too.
 _TURNS = ("yaw", "pitch", "roll")
+
+
+def _between(signals: Mapping[str, TimeSeries]) -> tuple[str, ...]:
+    """What is taken at the frames' times, from rows before the first one, too."""
+    return _TURNS[1:] if "x" in signals else (*_TURNS, "qw", "qx", "qy", "qz")
 
 
 def _from_first_frame(recording: RobotRecording) -> RobotRecording:
@@ -549,7 +553,7 @@ def _from_first_frame(recording: RobotRecording) -> RobotRecording:
     ]  # fmt: skip
     if not frames or "mean_speed" in signals:
         return recording
-    found, earlier = {}, (*_SENT, *_TURNS, *(() if "x" in signals else ("qw", "qx", "qy", "qz")))
+    found, earlier = {}, (*_SENT, *_between(signals))
     for name, (time, value) in signals.items():
         kept = time >= (time[0] if name.startswith(earlier) else min(frames))
         if kept.any():
@@ -611,15 +615,16 @@ class _View:
             self.quat = None
         spans = {n: s.time for n, s in signals.items()
                  if "mean_speed" in signals or not n.startswith(_SENT)}  # fmt: skip
-        beside = () if "x" in signals else ("qw", "qx", "qy", "qz")
-        between = () if "mean_speed" in signals else (*_TURNS, *beside)
-        kept = [t for n, t in spans.items() if n not in between]
+        kept = [
+            t for n, t in spans.items() if "mean_speed" in signals or n not in _between(signals)
+        ]
         self.begin = min(float(t[0]) for t in kept)
         self.end = max(float(t[-1]) for t in kept)
 
     def check_frames(self, window: float) -> None:
         """Refuses a recording of which a window has no two frames."""
-        usual = float(np.median(np.diff(self.time))) if len(self.time) > 2 else 0.0
+        time = self.time[np.isfinite(self.position).any(1)]
+        usual = float(np.median(np.diff(time))) if len(time) > 2 else 0.0
         if 2 * usual > window:
             raise InputError(
                 f"{self.recording.name}: expected frames less than {window / 2:.3g} s apart, half "

@@ -377,11 +377,12 @@ def _read_bag(
                 if (use := _TOPICS.get(kind)) is None:
                     continue
                 role = f"{kind} {topic}" if kind in _MANY else _role(kind)
+                if chosen.get(role, picked.get(role, topic)) != topic:
+                    continue
                 message = store.deserialize_cdr(raw, connection.msgtype)
                 if kind == "Float64MultiArray" and not _has_names(message, topic):
                     continue  # such as a sensor's numbers
-                if chosen.setdefault(role, picked.get(role, topic)) != topic:
-                    continue
+                chosen[role] = topic
                 for name, value in use(message, topic):
                     if names := modules.get(kind):
                         head, _, module = name.partition(".")

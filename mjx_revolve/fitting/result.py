@@ -263,6 +263,8 @@ def _predict(problem: FitProblem, state: FitState) -> tuple[Prediction, ...]:
             count = np.isfinite(wide).sum(2)
             seen, *both = np.where(count > 0, np.nansum(wide, 2) / np.maximum(count, 1), np.nan)
         is_speed = channel.kind == "speed"
-        row = recording.name, channel.time, ~channel.fitted, seen, both[0], both[1], is_speed
+        there = np.isfinite(seen).any(1) | is_speed  # rows of other sensors may lie between
+        time, held = channel.time[there], ~channel.fitted[there]
+        row = recording.name, time, held, seen[there], both[0][there], both[1][there], is_speed
         found.append(Prediction(*row))
     return tuple(sorted(found, key=lambda p: not p.held.all()))

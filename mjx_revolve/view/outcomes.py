@@ -14,6 +14,7 @@ from mjx_revolve.episodes.named_files import read_modules
 from mjx_revolve.episodes.run_reader import RunReader
 from mjx_revolve.episodes.tasks import TASKS, score_unit
 from mjx_revolve.evolution.sweeps import Plan
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import csv_table, short_path, write_atomic
 from mjx_revolve.view.population import read_population
 
@@ -73,16 +74,15 @@ def find_outcomes(
             words = " ".join(str(error).split())
             lost.append(f"{place}: expected a whole run; found: {words.removeprefix(place + ': ')}")
     # In a study that was made longer, a run that has not gone on yet is not finished.
-    longest: dict[str, int] = {}
-    for one in found:
-        longest[_typed(one)] = max(longest.get(_typed(one), 0), one.generations)
-    return [one for one in found if one.generations == longest[_typed(one)]], lost
+    return [one for one in found if one.generations >= _wanted(one.plan)], lost
 
 
-def _typed(outcome: Outcome) -> str:
-    """The generations that a run is to have, as they were typed; "" for those of its base."""
-    typed = dict(setting.split("=", 1) for setting in outcome.plan.settings)
-    return typed.get("evolution.generations", "")
+def _wanted(plan: Plan) -> int:
+    """The generations that a study asks of a run; 0 where its base is not there any more."""
+    try:
+        return plan.config.evolution.generations
+    except (InputError, OSError):
+        return 0
 
 
 def _read_outcome(plan: Plan, add: Callable[[str, Figures], Figures]) -> Outcome:
