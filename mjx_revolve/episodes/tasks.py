@@ -238,7 +238,7 @@ def speed(track: Track, settings: TaskConfig) -> jax.Array:
     moved = moved_through_water(track)[:, :2]
     if settings.horizon is not None:
         return safe_norm(tuple(_foretold(track, settings, moved)[1]))
-    # Along the way that is made at its depth: a loop whose lower half is off it goes nowhere.
+    # Along the way that is made at its depth: a loop with its lower half off it goes nowhere.
     keeps = _keeps_depth(track, settings)
     net = jnp.sum(moved * keeps[:, None], 0)
     along = jnp.sum(moved * net, 1) / jnp.maximum(safe_norm(tuple(net)), 1e-9)

@@ -377,7 +377,7 @@ def _urdf_hinge(joint: Element, missing: list[str]) -> _Hinge | None:
 # ------------------------------------------------------------------------------------------- MJCF
 
 _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
-# Gain and bias of an actuator whose force is its command times the gain.
+# Gain and bias of an actuator with a force of its command times the gain.
 _MOTOR = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE
 _MOVES_JOINTS = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _KINDS = {

@@ -36,7 +36,7 @@ class Outcome(NamedTuple):
         task: the task's type, and "in metres" where its scores are.
         unit: of the scores; "" where it is not known.
         evolved: whether bodies have evolved.
-        colony: whether in a colony, whose fitness is not its champion's score.
+        colony: whether in a colony: its fitness is not the champion's score.
         generations: that the run was to have, or intervals.
     """
 
