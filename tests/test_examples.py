@@ -21,7 +21,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 def long_ones(path):
     """What evolves, draws pages, differentiates or learns takes a quarter of a minute."""
-    long = path.stem[:2] in ("04", "05", "08", "10", "11", "12", "13", "16")
+    long = path.stem[:2] in ("03", "04", "05", "08", "10", "11", "12", "13", "16")
     return pytest.param(path, marks=pytest.mark.long if long else pytest.mark.slow)
 
 
