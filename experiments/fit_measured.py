@@ -17,15 +17,13 @@ import numpy as np
 
 from experiments import measured_data as data
 from experiments.common import make_parser, write_results
-from experiments.measured_cases import body
-from experiments.water_tank import world as tank
+from experiments.measured_cases import body, make_pool
 from mjx_revolve.fitting import FitSettings, RobotRecording, TimeSeries, fit_robot, load_recording
 from mjx_revolve.fitting.recording import read_map
 from mjx_revolve.fitting.result import Fit
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics import runtime
-from mjx_revolve.water.world import World
 
 GLIDE = Path(__file__).parents[2] / "shared" / "swimmers" / "amphibot_glide.csv"
 """The marks' tracks; they are not ours to ship (`AMPHIBOT_GLIDE` says where they are from)."""
@@ -34,13 +32,9 @@ _GAIT, _SETTLED = 8.5, 4.5  # length of a swim, and its mean speed is that from 
 _LEAST = 0.1  # slower gaits are left out of scatters, as in measured.md [m/s]
 
 
-def _pool(drag: str, timestep: float) -> World:
-    return tank(gravity=9.81, buoyancy="partial", drag=drag, added_mass=True, timestep=timestep)
-
-
 def fit_glide(drag: str = "cross_flow") -> Fit:
     """Drag and friction from the marks of 2 s of AmphiBot's glide."""
-    robot, half = body("ChainHead", _pool(drag, 0.001), "ChainModule", 6), data.CHAIN_MODULE / 2
+    robot, half = body("ChainHead", make_pool(drag, 0.001), "ChainModule", 6), data.CHAIN_MODULE / 2
     given = {f"angle.link{k}": str(np.radians(a)) for k, a in enumerate(data.AMPHIBOT_GLIDE.angles)}
     given["mark.0"] = "core"
     for k in range(6):
@@ -66,7 +60,7 @@ def glide_errors(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
 
 def fit_lamprey(drag: str = "cross_flow") -> Fit:
     """Drag and added mass from the mean speeds of every other gait of the lamprey robot."""
-    robot = body("ChainHead", _pool(drag, 0.002), "ChainModule", 5)
+    robot = body("ChainHead", make_pool(drag, 0.002), "ChainModule", 5)
     time, recordings = np.arange(0, _GAIT, 0.02), []
     for gait in data.LAMPREY:
         grown = np.minimum(time, 1.0) * np.radians(gait.amplitude)

@@ -334,8 +334,12 @@ def oscillating(
 _SAMPLES = 20  # steps from one record to the next
 
 
-def _pool(drag: str = World.drag, timestep: float = 0.001) -> World:
+def make_pool(drag: str = World.drag, timestep: float = 0.001) -> World:
+    """The water of a pool around robots that float."""
     return tank(gravity=G, buoyancy="partial", drag=drag, added_mass=True, timestep=timestep)
+
+
+_pool = make_pool  # as tests call it
 
 
 def _floating(robot: Robot) -> float:
@@ -387,7 +391,7 @@ def swim(
 
 def amphibot_glide(drag: str = World.drag) -> Found:
     """Way and rotation of a chain with frozen joints that glides at the surface."""
-    glide, robot = data.AMPHIBOT_GLIDE, body("ChainHead", _pool(drag), "ChainModule", 6)
+    glide, robot = data.AMPHIBOT_GLIDE, body("ChainHead", make_pool(drag), "ChainModule", 6)
     angles, half = np.radians(glide.angles), data.CHAIN_MODULE / 2
 
     def marks(q: np.ndarray) -> np.ndarray:
@@ -424,7 +428,7 @@ def amphibot_glide(drag: str = World.drag) -> Found:
 
 def swimmers(drag: str = World.drag) -> Found:
     """Speeds of chains that swim by their joints: AmphiBot, the lamprey robot, Mamba's ratio."""
-    gait, pool = data.AMPHIBOT_SWIM, _pool(drag)
+    gait, pool = data.AMPHIBOT_SWIM, make_pool(drag)
     [speed], _ = swim(body("ChainHead", pool, "ChainModule", 6), [gait])
     rows = [Row("AmphiBot", "swim", gait.speed, speed, "m/s")]
     speeds, _ = swim(body("ChainHead", pool, "ChainModule", 5), data.LAMPREY)
@@ -434,7 +438,7 @@ def swimmers(drag: str = World.drag) -> Found:
     joint = np.arange(8, 0, -1)[:, None]  # from the head; 1 is at the tail
     shares = np.concatenate([np.ones((8, 1)), (9 - joint) / 10], 1)
     gait = data.Gait(1 / 3, 40.0, 1 / 9, 0.0)
-    mamba = body("MambaHead", _pool(drag, 0.004), "MambaLink", 8)
+    mamba = body("MambaHead", make_pool(drag, 0.004), "MambaLink", 8)
     speeds, _ = swim(mamba, [gait, gait], shares, 15.0)
     measured = data.MAMBA["eel-like"] / data.MAMBA["lateral"]
     rows.append(Row("Mamba", "eel-like over lateral speed", measured, speeds[1] / speeds[0], "-"))

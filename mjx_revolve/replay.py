@@ -23,6 +23,7 @@ from mjx_revolve.inputs.commands import (
     check_episode_path,
     check_place,
     individual_name,
+    note_lost,
     opening_episode,
     program,
     read_path,
@@ -208,9 +209,7 @@ def main(argv: list[str] | None = None) -> int:
             made = [make_film(episode, arguments.size, arguments.fps)]
     paths = paths or {}
     for film in made:
-        if film.lost is not None:
-            words = f"the trajectory is not finite from {film.lost:.4g} s on; shown up to there"
-            print(f"note: {words}", file=sys.stderr)
+        note_lost(film.lost)
     if made:
         from mjx_revolve.view.film.video import write_film
 

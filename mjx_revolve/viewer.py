@@ -20,6 +20,7 @@ from mjx_revolve.inputs.commands import (
     check_episode_path,
     check_place,
     individual_name,
+    note_lost,
     opening_episode,
     program,
     read_path,
@@ -86,9 +87,7 @@ def main(argv: list[str] | None = None) -> int:
     from mjx_revolve.view.viewer import write_viewer
 
     episode, lost = finite_rows(episode)
-    if lost is not None:
-        words = f"the trajectory is not finite from {lost:.4g} s on; shown up to there"
-        print(f"note: {words}", file=sys.stderr)
+    note_lost(lost)
     write_viewer(episode, out)
     size = Path(out).stat().st_size / 1e6
     length = f"{episode.trajectory.time[-1]:.4g} s"

@@ -81,6 +81,13 @@ def refuse_blank(text: str, what: str = "an address or a file") -> str:
     return text
 
 
+def note_lost(lost: float | None) -> None:
+    """A line on stderr where what is shown of a trajectory ends before it, at a time [s]."""
+    if lost is not None:
+        words = f"the trajectory is not finite from {lost:.4g} s on; shown up to there"
+        print(f"note: {words}", file=sys.stderr)
+
+
 def read_world(text: str) -> str:
     """Reads the name or file of a world, for `add_argument(type=read_world)`; refuses ""."""
     return refuse_blank(text, "a world's name or file")
