@@ -124,6 +124,7 @@ def draw_swimmers(glide: Found, swum: Found) -> Any:
                    label=f"measured, {what} ({unit})")  # fmt: skip
         right.plot(time, scale * ours, color=color, label=f"ours, {what} ({unit})")
     right.set_xlabel("time (s)", fontsize=9)
+    right.set_ylabel("way (cm), rotation clockwise (°)", fontsize=9)
     right.set_title("AmphiBot glides, joints frozen")
     _finish(left, right)
     return figure

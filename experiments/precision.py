@@ -5,11 +5,12 @@
 Error: the distance between an episode's end and its end with converged steps (the reference),
 median over individuals, over the median way swum. Work: robot seconds per second of process CPU
 time, all engines in one process and measured in turn, so that other programs on the machine do not
-count. Engines in one water are given the same commands, those of our controller. Ours is held
-against a reference of its own, with a quarter of the shortest step; MuJoCo C's integrators against
-its RK4 with the same: joint limits are springs there and constraints here. `--only` measures some
-cases; with `--results` theirs replace those in docs/results/precision.json, from where
-docs/precision.png and docs/performance.md have them.
+count; of each engine at its shortest step and at the longest that does not blow up, and of those
+between by a line in 1 / step. Engines in one water are given the same commands, those of our
+controller. Ours is held against a reference of its own, with a quarter of the shortest step; MuJoCo
+C's integrators against its RK4 with the same: joint limits are springs there and constraints here.
+`--only` measures some cases; with `--results` theirs replace those in docs/results/precision.json,
+from where docs/precision.png and docs/performance.md have them.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import math
 import statistics
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -46,7 +47,8 @@ _OURS, _FEW = 64, 16  # individuals whose ends are compared: ours alone, and bes
 _DRAWN = 512  # random gaits, of which the best are swum; as many are timed
 # Individuals of MJX that are compared, and that are timed; steps of a call.
 _MJX, _TIMED, _CALL = 4, 64, 100
-_USUAL = 0.005  # the timestep that is timed [s]; a step takes as long whatever its length
+_USUAL = 0.005  # the timestep with which gaits are chosen, and whose rate is shown [s]
+_CLEAR = 20.0  # up to this error [%] hardly any individual blows up, which takes longer
 _RATE = 20  # of commands [Hz]; all steps divide its period
 _KEY = 1
 _LOST = 10.0  # what ends so many ways off has blown up
@@ -161,7 +163,7 @@ class Engine(Protocol):
         """With converged steps."""
         ...
 
-    def timed(self) -> tuple[Callable[[], Any], float]:
+    def timed(self, step: float) -> tuple[Callable[[], Any], float]:
         """What is timed, and the robot seconds that a call of it computes."""
         ...
 
@@ -306,11 +308,11 @@ class Ours:
         steps = stride * fitness.num_timesteps
         return draw_gusts(world, jax.random.key(_KEY), steps, 1)[::stride]
 
-    def timed(self) -> tuple[Callable[[], Any], float]:
+    def timed(self, step: float) -> tuple[Callable[[], Any], float]:
         """Whole episodes as an optimiser calls for them: controller, track and score included."""
         import jax
 
-        fitness, bodies = self.fitness(_USUAL)
+        fitness, bodies = self.fitness(step)
         key, genes = jax.random.key(_KEY), self.genes
         if self.case.robot:
             genes = jax.numpy.tile(genes, (_DRAWN // _OURS, 1))
@@ -319,7 +321,7 @@ class Ours:
         given = (genes, key) if self.case.robot else (bodies, genes, key)
         run = lambda: jax.block_until_ready(fitness.evaluate(*given))  # noqa: E731
         count = math.prod(genes.shape[:-1])
-        return run, count * fitness.num_timesteps * _USUAL
+        return run, count * fitness.num_timesteps * step
 
 
 # ------------------------------------------------------------------ MuJoCo
@@ -383,10 +385,9 @@ class C:
         found = self._run(self.ours.finest, "RK4")
         return found if np.isfinite(found[1]).all() else self._run(self.ours.finest, "Euler")
 
-    def timed(self) -> tuple[Callable[[], Any], float]:
-        """See `Engine`; with a step at which nothing blows up: that takes longer."""
-        step = self.ours.case.steps[-1]
-        seconds = len(self.models) * self.ours.duration * _USUAL / step
+    def timed(self, step: float) -> tuple[Callable[[], Any], float]:
+        """See `Engine`."""
+        seconds = len(self.models) * self.ours.duration
         return lambda: self._run(step, self.integrator), seconds
 
 
@@ -437,10 +438,10 @@ class Mjx:
         """See `Engine`: half of the shortest step shown."""
         return self.ends(self.ours.case.steps[-1] / 2)
 
-    def timed(self) -> tuple[Callable[[], Any], float]:
+    def timed(self, step: float) -> tuple[Callable[[], Any], float]:
         """See `Engine`; wider, as MJX gains by it."""
-        wide = np.tile(self.ours.commands(_USUAL)[:_CALL], (1, 1, _TIMED // _FEW))
-        return lambda: self._ends(_USUAL, wide), _TIMED * _CALL * _USUAL
+        wide = np.tile(self.ours.commands(step)[:_CALL], (1, 1, _TIMED // _FEW))
+        return lambda: self._ends(step, wide), _TIMED * _CALL * step
 
 
 # ------------------------------------------------------------------ a case
@@ -484,6 +485,24 @@ def work_at(points: Sequence[dict[str, Any]], percent: float) -> float | None:
     return None
 
 
+def timed_steps(known: Mapping[float, float | None]) -> list[float]:
+    """The steps that are timed: the shortest, and the longest that does not blow up."""
+    clear = [step for step, error in known.items() if error is not None and error <= _CLEAR]
+    return sorted({min(known), max(clear, default=min(known))})
+
+
+def cost_of(steps: Sequence[float], seconds: Sequence[float]) -> Callable[[float], float]:
+    """CPU seconds per robot second over the step, from those of one or two steps.
+
+    A step costs as long whatever its length; commands, records and episodes cost what they do per
+    robot second: a line in 1 / step.
+    """
+    if len(steps) == 1:
+        return lambda step: seconds[0] * steps[0] / step
+    each = (seconds[0] - seconds[1]) / (1 / steps[0] - 1 / steps[1])
+    return lambda step: seconds[0] + each * (1 / step - 1 / steps[0])
+
+
 def run_case(case: Case, sizes: Sizes) -> list[dict[str, Any]]:
     """A row for each engine: its points, and its work at the error of comparison."""
     engines = make_engines(case, sizes)
@@ -502,24 +521,30 @@ def run_case(case: Case, sizes: Sizes) -> list[dict[str, Any]]:
         errors.append(found)
         if isinstance(engine, Ours):
             converged = None
-    calls = [engine.timed() for engine in engines]
+    timed = [(number, step) for number, known in enumerate(errors) for step in timed_steps(known)]
+    calls = [engines[number].timed(step) for number, step in timed]
     for call, _ in calls:
         call()  # compiles
-    spent: list[list[float]] = [[] for _ in engines]
+    spent: list[list[float]] = [[] for _ in calls]
     for number in range(sizes.rounds):  # every other round backwards
         order = list(zip(calls, spent, strict=True))
         for (call, _), times in order if number % 2 == 0 else reversed(order):
             began = time.process_time()
             call()
             times.append(time.process_time() - began)
+    took = {
+        of: statistics.median(times) / seconds
+        for of, (_, seconds), times in zip(timed, calls, spent, strict=True)
+    }
     rows = []
-    for engine, (_, seconds), times, known in zip(engines, calls, spent, errors, strict=True):
-        rate = seconds / statistics.median(times) / _USUAL  # steps per core second
+    for number, (engine, known) in enumerate(zip(engines, errors, strict=True)):
+        steps = timed_steps(known)
+        cost = cost_of(steps, [took[number, step] for step in steps])
         points = [
             {
                 "step_ms": 1000 * step,
                 "error_percent": error,
-                "robot_seconds_per_core_second": rate * step,
+                "robot_seconds_per_core_second": 1 / cost(step),
             }
             for step, error in known.items()
         ]
@@ -528,7 +553,7 @@ def run_case(case: Case, sizes: Sizes) -> list[dict[str, Any]]:
                 "name": f"{case.name}: {engine.name}",
                 "case": case.name,
                 "engine": engine.name,
-                "steps_per_core_second": rate,
+                "steps_per_core_second": 1 / cost(_USUAL) / _USUAL,
                 "points": points,
                 "order": find_order(points),
                 "work": work_at(points, _PERCENT),
@@ -572,14 +597,15 @@ def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
             known = [p for p in row["points"] if p["error_percent"]]
             axis.loglog(
                 [p["robot_seconds_per_core_second"] for p in known],
-                [p["error_percent"] for p in known], "o-", label=row["engine"], markersize=4,
+                [p["error_percent"] for p in known], "o-", markersize=4,
+                label=row["engine"] if known else None,
             )  # fmt: skip
         axis.axhline(_PERCENT, color="0.7", linewidth=0.8)
         axis.set_title(name, fontsize=9)
         axis.xaxis.set_minor_formatter(NullFormatter())  # labels would overlap
         axis.set_xlabel("robot seconds per core second")
         axis.set_ylabel("error of the end [% of the way]")
-        axis.legend(fontsize=7)
+        axis.legend(fontsize=7, framealpha=0.5)
     for axis in list(axes.flat)[len(names) :]:
         axis.set_axis_off()
     figure.savefig(path, dpi=110)

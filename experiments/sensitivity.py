@@ -376,6 +376,7 @@ def draw(found: Sensitivity, others: Mapping[str, Sensitivity] = MappingProxyTyp
     many.set_xlabel("speed (cm/s): median, 5 to 95 %", fontsize=9)
     many.set_title(f"{DRAWS} draws from the ranges")
     if others:
+        many.set_ylim(top=len(names) + 0.3)
         many.legend(frameon=False, fontsize=9, loc="upper left")
     return figure
 

@@ -19,6 +19,7 @@ from matplotlib.axes import Axes
 from experiments.common import as_numbers, make_folder, make_parser, write_results
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.run_reader import RunReader
+from mjx_revolve.episodes.scoring import WORST
 from mjx_revolve.evolution.executor import make_executor
 from mjx_revolve.evolution.generations import Champion
 from mjx_revolve.evolution.run import Run
@@ -118,6 +119,7 @@ def study_main(
         print(f"{run['name']}: {run['score']['text']} body lengths/s, {run['seeds']} seeds")
     print(f"{len(outcomes)} of {len(plans)} runs; written: {name}.csv in {short_path(folder)}")
     if options.results:
+        numbers = numbers | {"settings": [*given_settings(options)]}
         write_results(name, numbers, sorted({one.plan.seed for one in outcomes}))
     return 0
 
@@ -257,13 +259,25 @@ def _champion_scores(config: Config, outcomes: Sequence[Outcome], share: float) 
     genes = [share * RunReader(o.plan.folder).load_champion().genes for o in outcomes]
     if config.bodies is None:
         brains = np.array(genes, np.float32)
-        return np.mean([fitness.evaluate(brains, key)[0] for key in keys], 0)
+        return _means([fitness.evaluate(brains, key)[0] for key in keys], outcomes)
     executor = Executor(fitness, fitness.block_size)
     some = [Individual(k, (), 0, "champion", None, o.body, None) for k, o in enumerate(outcomes)]
     rows = [np.zeros((1, fitness.num_genes), np.float32) for _ in some]
     for row, own, one in zip(rows, genes, some, strict=True):
         row[0, fitness.layout(one.body).columns] = own
-    return np.mean([[s[0] for s, _ in score_brains(executor, some, rows, key)] for key in keys], 0)
+    scores = [[s[0] for s, _ in score_brains(executor, some, rows, key)] for key in keys]
+    return _means(scores, outcomes)
+
+
+def _means(scores: Sequence[Any], outcomes: Sequence[Outcome]) -> np.ndarray:
+    """`[n]` means over starts, which a champion that fails in one has not."""
+    found = np.asarray(scores, float)
+    failed = ~np.isfinite(found) | (found <= WORST)
+    for outcome, starts in zip(outcomes, failed.sum(0).tolist(), strict=True):
+        if starts:
+            each = f"finite scores from {_STARTS} starts"
+            raise InputError(outcome.plan.name, each, f"{starts} that failed")
+    return found.mean(0)
 
 
 def describe_runs(

@@ -168,6 +168,7 @@ def test_ctrl_c_stops_after_the_generation_under_way(folder, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["--set", "evolution={seed: 9}"], "--set evolution.seed: expected --seeds N instead"),
         (["--set", "task.duration=5,-6"], "duration=-6: --set task.duration: expected a number >"),
         (
             ["--set", "evolution.population_size=8,16", "--set", "task.settle=1,11"],

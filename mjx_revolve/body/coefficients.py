@@ -21,7 +21,7 @@ from mjx_revolve.body.params import apply_overrides, check_overrides, multiply_f
 from mjx_revolve.body.placement import Module
 from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.files import path_inside, read_file
-from mjx_revolve.inputs.schema import checked, read
+from mjx_revolve.inputs.schema import checked, read, show
 from mjx_revolve.inputs.yaml_reader import dump_yaml, load_yaml, parse_yaml
 
 ALL = "all"
@@ -47,6 +47,8 @@ def load_coefficients(path: str | Path) -> dict[str, dict[str, Any]]:
     data = load_yaml(path)
     with reading(path):
         entries = read(_File, data).modules
+        if len(names := [*map(str, entries)]) > len({*names}):
+            raise InputError("modules", "each name once", show(names))
         return {str(k): check_overrides(v, f"modules.{k}") for k, v in entries.items()}
 
 
@@ -128,7 +130,8 @@ def merge_params(params: Mapping[str, Any], entry: Mapping[str, Any]) -> dict[st
     before, more = params.get("factors", {}), entry.get("factors", {})
     if before or more:
         both = {k: multiply_factors(x, before.get(k, 1.0)) for k, x in more.items()}
-        found["factors"] = before | both
+        # In the order in which they are read.
+        found |= check_overrides({"factors": before | both}, "params")
     return found
 
 

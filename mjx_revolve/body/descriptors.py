@@ -65,7 +65,8 @@ def describe(modules: Sequence[Module], extent: np.ndarray) -> dict[str, float]:
         extent: `[3]` edges of its bounding box at rest [m].
 
     Returns:
-        Units are in `UNITS`; shares lie between 0 and 1 with the catalogue's modules.
+        Units are in `UNITS`; shares lie between 0 and 1 with Revolve's modules (the most limbs are
+        those of a core with four slots).
 
         - num_modules, num_bricks, num_hinges, num_sensors, num_thrusters, num_fins: counts (bricks:
           all rigid modules but core, sensors, thrusters and fins; fins: modules with a part under

@@ -65,6 +65,7 @@ def exposure(parts: RestPose) -> Exposure:
     heights = np.stack([parts.low, parts.high], 1)[:, :, None]  # [npart, 2, distances, 3]
     heights = heights + (np.array([[-1], [1]]) * _DISTANCES)[..., None]
     before = (np.abs(heights[part] - center[:, None, None]) <= reach[:, None, None]).any(2)
+    thin = parts.high - parts.low < 2 * _DISTANCES[-1]
     side, axis, pair = np.nonzero((before & square[:, None, None]).transpose(1, 2, 0))
     covered = np.zeros((len(parts.low), 2, 3, _POINTS), np.uint32)
     neighbour = np.full((len(parts.low), 2, 3), -1)
@@ -72,20 +73,26 @@ def exposure(parts: RestPose) -> Exposure:
         within = _spans(parts, part, center, reach)
         beside = np.array(_BESIDE)[axis]
         hits = _rectangles(within[pair, beside[:, 0]], within[pair, beside[:, 1]])
+        # What a thin plate is mounted on is near its free face, too, but lies behind the other.
+        ends = np.stack([-parts.low, parts.high])[side, part[pair], axis]
+        out = np.where(side, center[pair, axis], -center[pair, axis])
+        behind = thin[part[pair], axis] & (out < ends - (parts.high - parts.low)[part[pair], axis])
+        hits = np.where(behind[:, None], np.uint32(0), hits)
         face = (part[pair] * 2 + side) * 3 + axis
         start = np.flatnonzero(np.append(True, np.diff(face)))
         covered.reshape(-1, _POINTS)[face[start]] = np.bitwise_or.reduceat(hits, start)
         # The last write holds: the box that covers most of a face. Boxes that only reach past an
         # edge have their centres beside the part, not in front of it.
         most = np.argsort(np.bitwise_count(hits).sum(1), kind="stable")
-        face_height = np.where(side, parts.high[part[pair], axis], -parts.low[part[pair], axis])
-        ahead = np.where(side, 1, -1) * center[pair, axis] > face_height
-        most = most[(hits.any(1) & ahead)[most]]
+        most = most[(hits.any(1) & (out > ends))[most]]
         neighbour.reshape(-1)[face[most]] = parts.box_part[box[pair[most]]]
     for k in np.flatnonzero(~square):
         low, high = parts.low[part[k]], parts.high[part[k]]
         grid = low + ((np.arange(_POINTS) + 0.5) / _POINTS)[:, None] * (high - low)
         for side, axis in np.ndindex(2, 3):
+            behind = center[k, axis] < low[axis] if side else center[k, axis] > high[axis]
+            if thin[part[k], axis] and behind:
+                continue
             one, two = _BESIDE[axis]
             points = np.empty((len(_DISTANCES), _POINTS, _POINTS, 3))
             points[..., axis] = heights[part[k], side, :, axis, None, None]

@@ -7,7 +7,7 @@ one behind the other, which costs little more than a single one.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -99,6 +99,24 @@ class Assembly:
     def meeting_pairs(self) -> np.ndarray:
         """`[pairs, 2]` parts of one robot that can meet; see `self_pairs.meeting_pairs`."""
         return meeting_pairs(self) if self.world.self_contact else np.zeros((0, 2), int)
+
+    def with_split_springs(self, armature: float | np.ndarray = 0.0) -> Assembly:
+        """The same with the implicit part of each servo's spring, from its hinge and its limb.
+
+        MuJoCo's Euler step takes the servo's spring explicitly and the joint's friction d
+        implicitly; it is well damped while k dt² is at most 1.7 (I + d dt). Only hinges that carry
+        next to nothing have stiffer servos. Drag that is extrapolated explicitly feeds what rings
+        in a few steps, so that springs are taken implicitly earlier there; a choice: with less
+        nothing is won.
+
+        Args:
+            armature: `[nbody]` of the hinges [kg·m²].
+        """
+        about = self.inertia + _steiner(self.mass, self.center)
+        inertia = np.sum(self.axis * turned(about, self.axis), 1) + armature
+        dt, share = self.world.timestep, 0.5 if is_extrapolated(self.world.drag) else 1.7
+        most = share * (inertia / dt**2 + self.damping / dt)
+        return replace(self, implicit_stiffness=np.maximum(self.stiffness - most, 0.0))
 
     @property
     def moved(self) -> np.ndarray:
@@ -206,13 +224,6 @@ def assemble(morphologies: Sequence[Morphology], world: World) -> Assembly:
     axis = np.array([(0.0, 0.0, 1.0) if h is None else h.axis for h in hinges])
     damping = FRICTION * effort / speed
     stiffness = effort / FULL_TORQUE_ERROR
-    # MuJoCo's Euler step takes the servo's spring explicitly and the joint's friction d implicitly;
-    # it is well damped while k dt² is at most 1.7 (I + d dt). Only hinges that carry next to
-    # nothing have stiffer servos. Drag that is extrapolated explicitly feeds what rings in a few
-    # steps, so that springs are taken implicitly earlier there; a choice: with less nothing is won.
-    about = np.sum(axis * turned(inertia + _steiner(mass, center), axis), 1)
-    dt, share = world.timestep, 0.5 if is_extrapolated(world.drag) else 1.7
-    most = share * (about / dt**2 + damping / dt)
     pushing = np.array([part.thruster is not None for part in layout.parts])[layout.kind]
     return Assembly(
         morphologies=tuple(morphologies),
@@ -234,10 +245,10 @@ def assemble(morphologies: Sequence[Morphology], world: World) -> Assembly:
         speed=speed,
         damping=damping,
         stiffness=stiffness,
-        implicit_stiffness=np.maximum(stiffness - most, 0.0),
+        implicit_stiffness=np.zeros(len(parent)),
         fluid=make_fluid_table(layout, carrier, place, turn, world),
         thruster_row=np.flatnonzero(pushing),
-    )
+    ).with_split_springs()
 
 
 def _weigh(

@@ -291,7 +291,8 @@ def fit_capacity(
         robots: from `build_robot`, in one world: the largest of them set the size.
         kinds: further types of modules that bodies may be made of, beside those of the robots.
         contact: whether they can touch the bed.
-        hinges: room for at least so many hinges; for robots that are not known yet.
+        hinges: room for at least so many hinges; for robots that are not known yet. Only beyond
+            those of `robots`, or with `modules`, there is room for other bodies with so many.
         rows: room for at least so many rows.
         modules: room for all bodies of these types with at most so many modules and `hinges`
             hinges, whatever their shape.
@@ -312,6 +313,8 @@ def fit_capacity(
     types = {id(k): k for k in (*(m.kind for r in robots for m in r.morphology.modules), *kinds)}
     # Nothing acts on what neither floats nor drags nor carries nor pushes.
     every = [x for x in columns.laws if not x.idle or carries or world.self_contact]
+    if modules:
+        hinges = max(hinges, int(sizes.hinges.max()))
     near = contact and world.bed is not None
     groups, order = _choose_groups(columns, sizes, every, bool(modules))
     count = max(1, rows, hinges, int(order.length.max()))

@@ -11,7 +11,7 @@ import numpy as np
 
 from mjx_revolve.engine.assembly import Assembly
 from mjx_revolve.engine.step_constants import LIMIT_OVERSHOOT, StepConstants, motor_line
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.numerics.spatial import quat_to_matrix
 
 # What an edit must leave as it is: the tables of water and contact follow from it.
@@ -21,8 +21,11 @@ _FIXED = (
     *("jnt_stiffness", "dof_frictionloss", "actuator_gear", "qpos_spring", "body_gravcomp"),
     *("jnt_actfrclimited", "jnt_actfrcrange", "actuator_dyntype", "actuator_gaintype"),
     # What our step takes from the robot.
-    *("qpos0", "actuator_trnid", "actuator_biastype"),
+    *("qpos0", "actuator_trnid", "actuator_biastype", "jnt_type", "site_pos"),
+    *("jnt_stiffnesspoly", "dof_dampingpoly"),  # of newer MuJoCo
 )
+# What it must leave as it is of a thruster.
+_THRUST = ("dynprm", "gainprm", "ctrlrange", "ctrllimited", "forcerange", "forcelimited")
 _COUNTS = ("nbody", "nq", "nv", "nu", "neq", "ntendon")
 
 
@@ -35,38 +38,67 @@ def check_edit(model: mujoco.MjModel, built: mujoco.MjModel, name: str) -> None:
         name: of the robot.
 
     Raises:
-        InputError: it differs in more than masses, inertias, hinges and servos.
+        InputError: it differs in more than masses, inertias, hinges and servos, or a number of
+            these is none that a robot can have.
     """
     changed = [x for x in _COUNTS if getattr(model, x) != getattr(built, x)]
     if not changed:
-        pairs = [(x, getattr(model, x), getattr(built, x)) for x in _FIXED]
+        pairs = [(x, getattr(model, x), getattr(built, x)) for x in _FIXED if hasattr(built, x)]
         pairs += [(f"opt.{x}", *(getattr(m.opt, x) for m in (model, built)))
                   for x in ("timestep", "gravity", "disableflags")]  # fmt: skip
         pairs += [(f"{x} of the core", getattr(model, x)[:6], getattr(built, x)[:6])
                   for x in ("dof_armature", "dof_damping")]  # fmt: skip
         pairs += [(x, getattr(model, x)[:, part], getattr(built, x)[:, part]) for x, part in
                   (("actuator_biasprm", 0), ("actuator_gainprm", slice(1, None)))]  # fmt: skip
+        thrust = built.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE
+        pairs += [(f"{x} of a thruster", *(getattr(m, f"actuator_{x}")[thrust]
+                  for m in (model, built))) for x in _THRUST]  # fmt: skip
         changed = [x for x, new, old in pairs if not np.allclose(new, old, atol=1e-9)]
     if changed:
         expected = "other masses, inertias, hinges or servos only"
         found = f"another {', '.join(changed)} (edit the morphology or the world instead)"
         raise InputError(f"model of {name!r}", expected, found)
+    positive = [(x, getattr(model, x)[1:] > 0) for x in ("body_mass", "body_inertia")]
+    least = [(x, getattr(model, x) >= 0) for x in ("dof_armature", "dof_damping")]
+    for x, fits in (*positive, *least):
+        if not np.all(fits & (getattr(model, x)[-len(fits) :] < np.inf)):
+            sign = ">= 0" if x.startswith("dof") else "> 0"
+            found = getattr(model, x).ravel().tolist()
+            raise InputError(f"model of {name!r}: {x}", f"finite numbers {sign}", show(found))
+    low, high = model.jnt_range[model.jnt_limited.astype(bool)].T
+    if not np.all(low < high):
+        raise InputError(f"model of {name!r}: jnt_range", "the lowest below the highest",
+                         show(model.jnt_range.tolist()))  # fmt: skip
 
 
-def edited_assembly(assembly: Assembly, model: mujoco.MjModel) -> Assembly:
-    """An assembly of one robot with the masses, inertias and hinges' ranges of a model."""
+def edited_assembly(assembly: Assembly, model: mujoco.MjModel, servos: Sequence[int]) -> Assembly:
+    """An assembly of one robot with the masses, inertias, hinges' ranges and springs of a model."""
     axes = quat_to_matrix(model.body_iquat)
     joint, reach = model.body_jntadr[2:], assembly.range.copy()
     # A hinge that an edit frees of its limits has no end stop, not even where neighbours meet.
     limited = model.jnt_limited[joint].astype(bool)[:, None]
     reach[2:] = np.where(limited, model.jnt_range[joint], reach[2:])
-    return replace(
+    dof, act = model.jnt_dofadr[joint], _servos_of(model, servos)
+
+    def filled(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+        return np.concatenate([old[:2], new]) if servos else old
+
+    edited = replace(
         assembly,
         mass=model.body_mass.copy(),
         center=model.body_ipos.copy(),
         inertia=np.einsum("bij,bj,bkj->bik", axes, model.body_inertia, axes),
         range=reach,
+        damping=filled(assembly.damping, model.dof_damping[dof]),
+        stiffness=filled(assembly.stiffness, -model.actuator_biasprm[act, 1]),
     )
+    return edited.with_split_springs(filled(np.zeros(len(reach)), model.dof_armature[dof]))
+
+
+def _servos_of(model: mujoco.MjModel, servos: Sequence[int]) -> np.ndarray:
+    """The actuators of the hinges, in the order of the bodies that these carry."""
+    servo = {int(model.actuator_trnid[k, 0]): k for k in servos}
+    return np.array([servo[int(j)] for j in model.body_jntadr[2:]], int)
 
 
 def edited_constants(
@@ -75,7 +107,7 @@ def edited_constants(
     """The constants of one robot with the hinges and servos of a model.
 
     Args:
-        constants: of the assembly with the model's masses and ranges.
+        constants: of the assembly with the model's masses, ranges and springs.
         model: the edited one.
         servos: its actuators that turn hinges.
 
@@ -85,24 +117,17 @@ def edited_constants(
     if not servos:
         return constants
     joint = model.body_jntadr[2:]
-    servo = {int(model.actuator_trnid[k, 0]): k for k in servos}
-    act = np.array([servo[int(j)] for j in joint], int)
+    act = _servos_of(model, servos)
     dof = model.jnt_dofadr[joint]
     effort = _limits(model.actuator_forcerange[act], model.actuator_forcelimited[act])
     target = _limits(model.actuator_ctrlrange[act], model.actuator_ctrllimited[act])
     stops = np.stack([np.asarray(x, float)[2:] for x in constants.hinges.range], 1)
     limits = _limits(stops, model.jnt_limited[joint])
     strong = np.where(np.isfinite(effort[:, 1]), effort[:, 1], 1.0)
-    ours, stiffness = constants.hinges, -model.actuator_biasprm[act, 1]
-    # Where a part of the spring was implicit, the limb takes no more of an explicit one.
-    implicit = np.asarray(ours.implicit_stiffness, float)[2:]
-    explicit = np.asarray(ours.stiffness, float)[2:] - implicit
+    ours = constants.hinges
     edited = {
         "armature": model.dof_armature[dof],
-        "damping": model.dof_damping[dof],
         "gain": model.actuator_gainprm[act, 0],
-        "stiffness": stiffness,
-        "implicit_stiffness": np.where(implicit > 0, np.maximum(stiffness - explicit, 0.0), 0.0),
         "servo_damping": -model.actuator_biasprm[act, 2],
         "effort": tuple(effort.T),
         "target": tuple(target.T),

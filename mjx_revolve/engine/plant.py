@@ -21,6 +21,7 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.sites import ModuleSites, Sites
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.numerics.spatial import cast
+from mjx_revolve.water.world import World
 
 # Centres of mass and of volume nearer than this are one point [m]: those of symmetric bodies are,
 # but for rounding. A choice.
@@ -36,7 +37,7 @@ class BodyGeometry(NamedTuple):
         weight: in air [N].
         lowest: extent of the rest pose below the core's centre [m].
         radius: extent of the rest pose from the core's vertical axis [m].
-        sinks: whether the water carries less than half of its weight.
+        sinks: whether it may fall fast: the water carries less than `least_lift` of its weight.
         num_hinges: how many hinges it has.
         up: `[3]` or `[3, lanes]` direction from the centre of mass to that of the displaced volume
             at rest, core frame: it points up when the body is in equilibrium in deep water.
@@ -85,12 +86,20 @@ def body_geometries(assembly: Assembly) -> BodyGeometry:
         weight=mass * max(world.gravity, 1e-9),
         lowest=-np.minimum.reduceat(corners[..., 2].min(1), first),
         radius=np.maximum.reduceat(across.max(1), first),
-        sinks=(displaced < mass / 2) | (world.buoyancy == "off"),
+        sinks=(displaced < least_lift(world) * mass) | (world.buoyancy == "off"),
         num_hinges=np.array([float(body.num_hinges) for body in assembly.morphologies]),
         up=np.where(hangs, lever / np.where(hangs, arm, 1.0), (0.0, 0.0, 1.0)).T,
         center=heavy.T,
         thrust=np.bincount(layout.body[assembly.thruster_row], np.array(thrust, float), robots),
     )
+
+
+def least_lift(world: World) -> float:
+    """Share of its weight that the water must carry so that a body sinks no faster than it swims.
+
+    Where nothing drags, whatever is heavier than the water falls freely.
+    """
+    return 1.0 if world.drag in ("off", "fossen") else 0.5
 
 
 def stretched_lengths(assembly: Assembly) -> np.ndarray:

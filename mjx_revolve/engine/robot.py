@@ -52,7 +52,8 @@ class Robot:
 
         Both engines use these numbers. The tables of water and contact points follow from the
         modules' shapes and are not changed; so an edit must not change bodies, hinges' positions
-        and axes, timestep or gravity.
+        and axes, thrusters, timestep or gravity. A hinge that it frees of its limits has no end
+        stop, and modules that meet only beyond the range as built do not push each other apart.
 
         Args:
             model: `mj_spec` or a copy of `mj_model`, edited.
@@ -79,7 +80,9 @@ class Robot:
     def assembly(self) -> Assembly:
         """Its moving bodies and hinges; the single source of numbers for every engine."""
         built = assemble([self.morphology], self.world)
-        return built if self.edited_model is None else edited_assembly(built, self.edited_model)
+        if self.edited_model is None:
+            return built
+        return edited_assembly(built, self.edited_model, self.servos)
 
     @property
     def fluid(self) -> FluidTable:

@@ -21,7 +21,7 @@ _AT_HINGE = 1e-3
 # what slides along each other. A choice: the overlap that contacts tolerate.
 _DEEPER = 5e-4
 # Angles beyond the end stops [rad] and gaps [m] that a pair must keep to be left out. Choices: end
-# stops give way by half a degree.
+# stops give way by about half a degree.
 _RANGE_MARGIN, _CLEARANCE = 0.02, 1e-3
 # Boxes of angles that are looked at, for one pair and for one robot. A choice: some tens of
 # milliseconds; with five times fewer, twice as many pairs of long random bodies stay undecided, and

@@ -45,7 +45,7 @@ from mjx_revolve.water.laws import (
 from mjx_revolve.water.plate_wake import thinness
 
 # Stiffness of a joint's end stop, as full effort per this overshoot [rad]. A choice: stiff enough
-# to keep within half a degree of the real range; the step treats it implicitly, so it is stable.
+# to keep within a degree of the real range; the step treats it implicitly, so it is stable.
 LIMIT_OVERSHOOT = 0.008
 # Share of its top speed up to which a servo gives its full effort [-]. A choice, between the
 # straight line of a bare motor (0) and Revolve's box of effort and speed (1).

@@ -37,6 +37,7 @@ from mjx_revolve.engine.plant import (
     Plant,
     actuators_of,
     body_geometry,
+    least_lift,
     plant_of,
 )
 from mjx_revolve.engine.population import PopulationEngine
@@ -589,7 +590,8 @@ def make_mixed_fitness(
     if modules:  # no body is longer than this, and one sinks only if one of its types does
         types = [*(m.kind for robot in robots for m in robot.morphology.modules), *kinds]
         longest = modules * max(map(_diagonal, types))
-        heavy = any(world.density * kind.volume < kind.mass / 2 for kind in types)
+        least = least_lift(world)
+        heavy = any(world.density * kind.volume < least * kind.mass for kind in types)
         sinks = world.buoyancy == "off" or (heavy and config.trim != "neutral")
         thrust = modules * max(
             sum(p.thruster.largest_thrust for p in kind.parts if p.thruster is not None)

@@ -432,7 +432,8 @@ def joint_checks(
     if not robot.num_hinges:
         return
     time, step = np.asarray(trajectory.time), robot.world.timestep
-    rows, step = time >= settle, step * round(float(time[1] - time[0]) / step)
+    # The last two rows always count, as in `scoring.first_scored_row`.
+    rows, step = time >= min(settle, time[-2]), step * round(float(time[1] - time[0]) / step)
     motion = trajectory.qpos, trajectory.qvel, trajectory.ctrl
     qpos, qvel, ctrl = (np.asarray(x)[rows] for x in motion)
     moved, varied = robot.assembly.moved, trajectory.variation

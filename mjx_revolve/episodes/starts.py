@@ -61,8 +61,9 @@ def check_key(key: object) -> None:
     Raises:
         InputError: it is something else.
     """
-    dtype = getattr(key, "dtype", None)
-    if dtype is None or not (jnp.issubdtype(dtype, jax.dtypes.prng_key) or dtype == jnp.uint32):
+    dtype, shape = getattr(key, "dtype", None), getattr(key, "shape", None)
+    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
+    if not (shape == () if typed else dtype == jnp.uint32 and shape in ((2,), (4,))):
         raise InputError("key", "jax.random.key(SEED)", repr(key))
 
 

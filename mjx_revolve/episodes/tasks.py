@@ -121,10 +121,18 @@ def start_at_depth(
 def start_on_bed(
     settings: TaskConfig, world: World, figure: BodyGeometry, place: jax.Array
 ) -> jax.Array:
-    """The lowest corner 5 mm above the bed, see `reach_below`; arguments of `start_at_depth`."""
+    """The lowest corner 5 mm above the bed, see `reach_below`; arguments of `start_at_depth`.
+
+    Above the highest of the bed around: at the core's place, and at half and whole its radius.
+    """
     assert world.bed is not None
-    below = reach_below(settings, figure)
-    return place.at[2].set(bed_height(world.bed, place[0], place[1]) + below + 0.005)
+    angles = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    around = np.outer([np.cos(angles), np.sin(angles)], [0.5, 1.0]).reshape(2, -1)
+    around = np.concatenate([np.zeros((2, 1)), around], 1)
+    radius = jnp.asarray(figure.radius)[..., None]
+    x, y = (place[k][..., None] + radius * around[k] for k in range(2))
+    top = jnp.max(bed_height(world.bed, x, y), -1)
+    return place.at[2].set(top + reach_below(settings, figure) + 0.005)
 
 
 def start_above_bed(
@@ -262,12 +270,12 @@ def _foretold(track: Track, settings: Any, moved: jax.Array) -> tuple[jax.Array,
     way = (safe_norm(tuple(first)) + safe_norm(tuple(second))) / 2
     ahead = first[0] * second[0] + first[1] * second[1]
     aside = first[0] * second[1] - first[1] * second[0]
-    # Where nothing moves there is no turn, and no derivative of it.
-    rests = jnp.where(way > 0, 0.0, 1.0)
-    turn = jnp.arctan2(aside, ahead + rests) / 2
+    # Where nothing moves there is no angle, and no derivative of it.
+    angle = lambda y, x: jnp.arctan2(y, x + jnp.where((x == 0) & (y == 0), 1.0, 0.0))  # noqa: E731
+    turn = angle(aside, ahead) / 2
     count = settings.horizon / (half * track.interval)
     straight = jnp.sinc(count * turn / np.pi) / jnp.sinc(turn / np.pi)
-    heading = jnp.arctan2(first[1], first[0] + rests) + (count - 1) * turn
+    heading = angle(first[1], first[0]) + (count - 1) * turn
     height = track.position[:, 2] - track.start_height
     begun, ended = (jnp.mean(height[k : k + half + 1], 0) for k in begins)
     heights = begun + np.linspace(0, 1, _MOMENTS)[:, None] * count * (ended - begun)

@@ -116,7 +116,8 @@ def cell_of(archive: Archive, points: np.ndarray) -> np.ndarray:
 
     Returns:
         `[N]` cells; -1 where a value is not finite. A point on a border of a grid belongs to the
-        cell above it. In a tessellation it is the nearest centre, each axis having length 1.
+        cell above it, up to rounding. In a tessellation it is the nearest centre, each axis having
+        length 1.
     """
     points = np.asarray(points, float)
     found = np.full(len(points), -1)

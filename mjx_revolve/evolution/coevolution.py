@@ -202,7 +202,8 @@ class BodyEvolution(IndividualEvolution, Evolution[BodySearch, _Proposal, list[I
             survivors = self.scheme.survivors(candidates, self.selection, mu, generation)
             living = [together[k] for k in survivors]
         trials = sum(individual.trials for individual in born)
-        trials += len(together) * self.selection.reevaluate
+        # What has failed is not evaluated again.
+        trials += self.selection.reevaluate * sum(one.learnt is not None for one in together)
         past, ids = self._add_most_novel(search, born, new[old:])
         found = replace(
             search,

@@ -205,7 +205,11 @@ def reading_state(
         found = int(arrays["seed"])
         if found != seed:
             raise InputError("seed", f"evolution.seed {seed}", found)
-        yield {name: arrays[name].item() for name in counters}
+        counted = {name: arrays[name].item() for name in counters}
+        for name, count in counted.items():
+            if isinstance(count, str | bytes | complex) or not count >= 0:
+                raise InputError(name, "a number >= 0", count)
+        yield counted
     except InputError:
         raise
     except (KeyError, ValueError, TypeError, AttributeError, OverflowError) as error:

@@ -84,6 +84,8 @@ class _Learner:
     def ask(self, strategy: Strategy | Perturbation, turn: int) -> None:
         """Draws the brains to be tried next; the very first is the one of birth."""
         tried, self.state = strategy.ask(jax.random.fold_in(self.key, 2 * turn), self.state)
+        if isinstance(strategy, Strategy) and strategy.name == "RandomSearch":
+            tried = tried + self.birth  # evosax's has no mean
         # A strategy may have run into numbers that are not finite; its state is then of no use.
         self.tried = np.where(np.isfinite(tried), tried, self.birth).astype(np.float32)
         if turn == 0:

@@ -36,6 +36,7 @@ from mjx_revolve.inputs.commands import check_output_folder, describe_refusal
 from mjx_revolve.inputs.errors import InputError, reading
 from mjx_revolve.inputs.files import SWEEP, short_path, write_atomic
 from mjx_revolve.inputs.grids import MOST_SEEDS, combine, read_axes
+from mjx_revolve.inputs.overrides import read_overrides, sets
 from mjx_revolve.inputs.schema import Integer, Text, TupleOf, checked, read
 from mjx_revolve.inputs.trust import opening, opening_config
 from mjx_revolve.inputs.yaml_reader import dump_yaml, load_yaml
@@ -167,7 +168,8 @@ class Sweep:
         """
         axes = read_axes(self.settings)
         for axis in axes:
-            if axis.key == "evolution.seed":
+            given = (read_overrides([f"{axis.key}={text}"])[0] for text in axis.texts)
+            if any(sets(one, "evolution.seed") for one in given):
                 raise InputError("--set evolution.seed", "--seeds N instead", "it set")
         return combine(axes, Path(self.config).stem)
 

@@ -99,7 +99,9 @@ def grow(network: CPPN, space: Space) -> Morphology:
         for parent, slot in wave:
             step = growth.direction(parent, slot)
             slots_at.append([a + b for a, b in zip(places[parent], step, strict=True)])
-        found = network.evaluate(np.array([[1.0, *place, depth] for place in slots_at]))
+        # Of weights near the largest number, outputs may be infinite.
+        inputs = np.array([[1.0, *place, depth] for place in slots_at])
+        found = np.nan_to_num(network.evaluate(inputs))
         best = found[:, :-1].argmax(axis=1).tolist()
         turns = np.rint(found[:, -1]).tolist()
         after = []

@@ -21,6 +21,7 @@ so that a rule can describe any body.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -28,6 +29,7 @@ from annotated_types import Ge, Unit
 
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import make_morphology
+from mjx_revolve.body.placement import GROWN_TOLERANCE
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.genotypes.genotype import Genotype, Space, make_genotype, pick
 from mjx_revolve.genotypes.growth import Growth
@@ -145,7 +147,12 @@ def make_plasticoding(space: Space, params: Mapping[str, object], place: str) ->
 
     def adopt(body: Morphology) -> Grammar:
         spelled = (CORE, *(f"#{module.name}" for module in body.modules[1:]))
-        return Grammar(body.name, {CORE: spelled} | dict.fromkeys(names, ()), body)
+        grammar = Grammar(body.name, {CORE: spelled} | dict.fromkeys(names, ()), body)
+        grown, wanted = develop(grammar).modules, {module.name for module in body.modules}
+        if lost := sorted(wanted - {module.name for module in grown}):
+            apart = f"modules that overlap by at most {2e3 * GROWN_TOLERANCE:g} mm, to grow them"
+            raise InputError(body.name, apart, f"more at {', '.join(lost)}")
+        return grammar
 
     return make_genotype(
         space,
@@ -242,7 +249,7 @@ def draw_sentence(
             turtle.mount(letters[letter])
         elif letter.startswith("#"):
             turtle.spell(letter[1:])
-    return turtle.growth.finish(name)
+    return replace(turtle.growth.finish(name), sensors=seed.sensors if seed else None)
 
 
 class _Turtle:

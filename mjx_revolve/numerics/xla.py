@@ -394,8 +394,10 @@ class Graph:
     def _compute(self, operations: list[_Operation], values: dict[int, Any]) -> None:
         for op in operations:
             inputs = [_value(values, v) for v in op.inputs]
-            out = op.equation.primitive.bind(*inputs, **op.equation.params)
-            out = out if op.equation.primitive.multiple_results else [out]
+            primitive = op.equation.primitive
+            # As JAX evaluates a jaxpr: rules of custom derivatives are bound as functions.
+            out = primitive.bind(*inputs, **primitive.get_bind_params(op.equation.params))
+            out = out if primitive.multiple_results else [out]
             for v, x in zip(op.outputs, out, strict=True):
                 values[v] = materialize_p.bind(x) if self._stored.get(v) else x
 

@@ -15,7 +15,8 @@ Drag follows from that lift: with a rounded nose, the force is across the flow a
 leaves it, C_L sin(α - α_e), and what trails from the tips costs C_L² / (π A e); with a sharp edge,
 there is no suction, and the force is normal to the plate, C_L tan α. On top come friction and, past
 the stall, what the fin has across the flow. Lift is across the velocity of the point where it acts,
-and drag never below 0, so the water never works: energy that a wake gives back is left out.
+and drag never below 0, so the water never works, but for a pitching moment (`cma`, Gazebo's):
+energy that a wake gives back is left out.
 
 It is stepped exactly for a velocity that holds for the step, depends on velocities through the
 water only, and decays out of the water. Against turning a fin has its faces' drag (`lift_drag`).

@@ -102,8 +102,8 @@ class Thruster:
 
     @property
     def largest_thrust(self) -> float:
-        """The size of its thrust at the ends of its range [N]."""
-        return max(abs(self.thrust_at(command)) for command in self.range)
+        """The size of its largest thrust at any command of its range [N]."""
+        return max(abs(self.thrust_at(command)) for command in (*self.range, *self.commands))
 
     def scaled(self, factor: float) -> Thruster:
         """The same with thrust multiplied by a factor at every command.

@@ -129,7 +129,7 @@ class World:
         name: what it is called.
         density: of the water [kg/m³]. 999.1026 at 15 °C is the thesis's value.
         viscosity: dynamic, of the water [Pa·s]; of MuJoCo's two laws, and of friction along
-            chains, plates and fins. 1.138e-3 at 15 °C.
+            chains, rods and fins. 1.138e-3 at 15 °C.
         gravity: downwards [m/s²].
         surface_height: z of the water surface, world frame [m].
         current: velocity of the water, world frame [m/s], length 3.

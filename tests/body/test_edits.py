@@ -1,5 +1,7 @@
 """Edits of bodies: what each one does and refuses, and random sequences of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
@@ -17,6 +19,7 @@ from mjx_revolve.body.edits import (
 )
 from mjx_revolve.body.morphology import Morphology, load_morphology, make_morphology
 from mjx_revolve.body.placement import find_overlaps
+from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.inputs.errors import InputError
 
 SHIPPED = {path.stem: load_morphology(path) for path in OURS}
@@ -81,6 +84,8 @@ def test_a_module_is_removed_with_all_that_it_carries():
     assert [m.parent for m in body.modules] == [-1, 0, 1, 0]
     check_valid(body)
     assert graft_subtree(body, "core", 0, SMALL, "hip") == SMALL
+    sensed = replace(SMALL, sensors=(Sensor("gyro", at="hip"), Sensor("depth")))
+    assert remove_module(sensed, "hip").sensors == sensed.sensors[1:]
 
 
 def test_a_module_is_replaced_and_keeps_its_place():

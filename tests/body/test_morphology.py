@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from laboratory import OURS, ROOT, WILD, body, check_refused, refusal, world, write
-from mjx_revolve.body.catalogue import MODULES, THESIS_MODULES, LiftDrag
+from mjx_revolve.body.catalogue import MODULES, THESIS_MODULES, LiftDrag, load_modules
 from mjx_revolve.body.coefficients import read_morphology_files
 from mjx_revolve.body.exposure import exposure
 from mjx_revolve.body.morphology import (
@@ -221,7 +221,8 @@ def test_fitted_coefficients_count_once_and_come_back_from_a_file(tmp_path):
             (tmp_path / place).write_bytes(content)
         assert load_morphology(tmp_path / path.name).mass == robot.mass
     # Whatever of its mass a module has of its own, the saved robot is the one that was read.
-    for own, entry in (("factors: {mass: 2}", "ballast: 0.01"), ("ballast: 0.02", "mass: 0.05")):
+    for own, entry in (("factors: {mass: 2}", "ballast: 0.01"), ("ballast: 0.02", "mass: 0.05"),
+                       ("factors: {mass: 2}", "factors: {drag: 2, added_mass: 3}")):  # fmt: skip
         (tmp_path / "own.yaml").write_text(f"modules: {{all: {{{entry}}}}}")
         text = f"coefficients: own.yaml\nbody: {{type: Core, params: {{{own}}}}}"
         robot = read(tmp_path, text)
@@ -610,6 +611,15 @@ def test_exposed_shares_of_a_chain_counted_by_hand(tmp_path):
     hidden = np.prod([(np.abs(ticks * size[k]) <= brick[k] / 2).mean() for k in (1, 2)])
     assert core == pytest.approx([1 - hidden / 2, 1, 1])
     assert (first.min(), last.min()) == (0.0, 0.5)  # joined on both sides, on one
+    # So is a sheet of 1 mm on a brick, close to which lies its free face.
+    sheet = (
+        "modules: {Sheet: {mount: {position: [0, -0.002, 0], outward: [0, 1, 0]}, parts: [{name: "
+        "a, boxes: [{size: [0.034, 0.001, 0.034]}], mass: 0.002, volume: 1.0e-6}]}}"
+    )
+    (tmp_path / "sheet.yaml").write_text(sheet)
+    kinds = MODULES | load_modules(tmp_path / "sheet.yaml")
+    robot = read(tmp_path, text.replace("{type: FixedBrick}", "{type: Sheet}"), modules=kinds)
+    assert exposure(robot.layout).shares[2].tolist() == [1.0, 0.5, 1.0]
 
 
 def chain(depth: int) -> str:

@@ -177,6 +177,9 @@ def test_an_edited_model_is_a_new_robot(kind):
     assert np.allclose(after.gain, before.gain)
     doubled = 2 if kind == "model" else 1
     assert other.assembly.mass[5] == pytest.approx(doubled * robot.assembly.mass[5])
+    edit = copy.copy(robot.mj_model)
+    edit.actuator_gainprm[:, 0], edit.actuator_biasprm[:, 1] = 99, -99
+    assert robot.with_model(edit).assembly.implicit_stiffness[2:].min() > 0
     again = pickle.loads(pickle.dumps(other))
     assert again.mj_model.dof_damping[9] == 0.5
     need_mjx()
@@ -205,6 +208,17 @@ def test_what_an_edited_model_may_not_change():
     words = "another jnt_stiffness, qpos0, dof_damping of the core, actuator_biasprm"
     with pytest.raises(InputError, match=words):
         robot.with_model(edit)
+    for name, row, value, words in (
+        ("actuator_gainprm", (0, 0), 9.0, "another gainprm of a thruster"),
+        ("body_mass", 1, -1.0, "body_mass: expected finite numbers > 0; found"),
+        ("dof_damping", 6, np.nan, "dof_damping: expected finite numbers >= 0"),
+        ("jnt_range", (1, 1), -2.0, "jnt_range: expected the lowest below the highest"),
+    ):
+        jet = build_robot(body("auv" if "gain" in name else "snake"), world())
+        edit = copy.copy(jet.mj_model)
+        getattr(edit, name)[row] = value
+        with pytest.raises(InputError, match=words):
+            jet.with_model(edit)
     spec = robot.mj_spec
     spec.geoms[0].size = [-1.0, 0.0, 0.0]
     with pytest.raises(InputError, match="expected one that MuJoCo can compile"):

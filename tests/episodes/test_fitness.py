@@ -168,7 +168,9 @@ def test_a_horizon_foretells_the_way_of_a_circle(rate, rows):
     along = 2.0 if rate == 0 else 2 * np.sin(120 * rate) / rate / 120
     assert float(ahead) == pytest.approx(along, abs=2e-3)
     assert np.isfinite(slopes).all()
-    assert np.isfinite(_of_a_horizon(0 * given.position)[3]).all()
+    for half in (0, 1):  # at rest all along, and as windows see it: from its middle on
+        rested = given.position.at[len(x) // 2 * half :].set(given.position[len(x) // 2 * half])
+        assert np.isfinite(_of_a_horizon(rested)[3]).all()
 
 
 @jax.jit

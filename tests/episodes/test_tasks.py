@@ -10,9 +10,11 @@ from laboratory import ELBOW, body, make_track, read
 from mjx_revolve import InputError, make_fitness, make_mixed_fitness
 from mjx_revolve.body.edits import add_module
 from mjx_revolve.engine.plant import body_geometry
+from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.config import TaskConfig
 from mjx_revolve.episodes.starts import draw_starts, episode_context, start_pose, target_path
-from mjx_revolve.episodes.tasks import RECORDS, TASKS, Task
+from mjx_revolve.episodes.tasks import RECORDS, TASKS, Task, start_on_bed
+from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.world import load_world
 
 KEY, G, RHO = jax.random.key(0), 9.81, 999.1026
@@ -170,6 +172,17 @@ def test_what_points_down_is_turned_half_way_round(settings):
     down = np.zeros(3)
     mujoco.mju_rotVecQuat(down, np.array([0.0, 0.0, -1.0]), np.asarray(pose[3:, 0], float))
     assert down == pytest.approx([0, 0, 1], abs=1e-6)
+
+
+def test_what_starts_on_a_slope_starts_outside_it():
+    """Wherever the core stands, no corner is in the bed."""
+    lake = load_world("lake", bed={"kind": "lake", "height": -0.3, "highest": 0.15, "extent": 1.8})
+    figure = body_geometry(build_robot(body("spider"), lake))
+    around = figure.radius * np.exp(1j * np.linspace(0, 2 * np.pi, 100))
+    for x in np.linspace(-0.7, 0.7, 9):
+        place = jnp.array([x, 0.2, 0.0])
+        lowest = start_on_bed(TaskConfig(type="crawl"), lake, figure, place)[2] - figure.lowest
+        assert lowest > np.max(bed_height(lake.bed, x + around.real, 0.2 + around.imag))
 
 
 def test_what_starts_on_the_bed_starts_level(settings):

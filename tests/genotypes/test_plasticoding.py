@@ -8,6 +8,7 @@ import pytest
 from laboratory import tree
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import load_morphology
+from mjx_revolve.body.sensors import Sensor
 from mjx_revolve.genotypes.genotype import Space
 from mjx_revolve.genotypes.kinds import find_genotype
 from mjx_revolve.genotypes.plasticoding import Grammar, draw_sentence, expand, make_alphabet
@@ -175,6 +176,8 @@ def test_a_robot_is_spelled_out():
     for iterations in (1, 5):
         other = find_genotype("plasticoding", SPACE, {"iterations": iterations}, "test.yaml")
         assert other.develop(other.adopt(spider)) == spider
+    sensed = replace(spider, sensors=(Sensor("depth"),))
+    assert genotype.develop(genotype.adopt(sensed)) == sensed
     # A letter behind a module's is drawn there.
     at = genome.rules["C"].index("#front_foot") + 1
     rule = (*genome.rules["C"][:at], "addl", "F", *genome.rules["C"][at:])

@@ -65,6 +65,8 @@ def test_the_table_of_a_thruster_is_its_curve(name):
     thruster = ALL[name]
     clamped = LANES.clip(*thruster.range)
     assert thrust(thruster, clamped) == pytest.approx([thruster.thrust_at(x) for x in LANES])
+    line = np.linspace(*thruster.range, 2001)
+    assert thruster.largest_thrust >= max(abs(thruster.thrust_at(x)) for x in line)
     twice = thruster.scaled(2.0)
     assert thrust(twice, clamped) == pytest.approx(2 * thrust(thruster, clamped), abs=1e-15)
 
