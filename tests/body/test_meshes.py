@@ -103,14 +103,11 @@ def test_files_in_millimetres_are_read(tmp_path):
     np.testing.assert_allclose(mesh_center_of_volume(found), (1e-3, 2e-3, 3e-3), atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("path", "message"),
-    [
-        ("../part.stl", "expected a path inside {folder}; found one that leads out"),
-        ("missing.stl", "expected a file; found none"),
-        ("part.dae", "expected one of .stl, .obj, .ply; found '.dae'"),
-    ],
-)
+@pytest.mark.parametrize(("path", "message"), [
+    ("../part.stl", "expected a path inside {folder}; found one that leads out"),
+    ("missing.stl", "expected a file; found none"),
+    ("part.dae", "expected one of .stl, .obj, .ply; found '.dae'"),
+])  # fmt: skip
 def test_bad_files_are_refused(tmp_path, path, message):
     expected = f"{path}: {message.format(folder=tmp_path)}"
     (tmp_path / "part.dae").write_text("<COLLADA/>")

@@ -222,13 +222,10 @@ def test_a_box_at_rest_presses_its_halves_by_their_levers():
     assert np.concatenate(cells) == pytest.approx(lever, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("sensor", "message"),
-    [
-        ({"type": "gyro", "at": "a", "each": "Core"}, "0.each: expected none, as there is `at`"),
-        ({"type": "touch"}, "0.at: expected the id of a module, as touch sits on one; found"),
-    ],
-)
+@pytest.mark.parametrize(("sensor", "message"), [
+    ({"type": "gyro", "at": "a", "each": "Core"}, "0.each: expected none, as there is `at`"),
+    ({"type": "touch"}, "0.at: expected the id of a module, as touch sits on one; found"),
+])  # fmt: skip
 def test_sensors_that_cannot_sit_there(sensor, message):
     check_refused(f"sensors.{message}", schema.read, SensorRow, [sensor], "sensors")
 

@@ -53,14 +53,11 @@ def test_what_only_drifts_fails_without_its_brain_alone(tmp_path, monkeypatch):
     np.testing.assert_allclose(*both, rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("rest", "worst"),
-    [
-        (-1.5, 0.3 / 1.37),  # most of what the brain adds is lost in the worst tenth
-        (-9.0, 7.8 / 8.87),
-        (-0.02, np.nan),  # it adds nothing, of which there are no shares
-    ],
-)
+@pytest.mark.parametrize(("rest", "worst"), [
+    (-1.5, 0.3 / 1.37),  # most of what the brain adds is lost in the worst tenth
+    (-9.0, 7.8 / 8.87),
+    (-0.02, np.nan),  # it adds nothing, of which there are no shares
+])  # fmt: skip
 def test_scores_that_are_no_rates_are_judged_by_what_the_brain_adds(
     tmp_path, monkeypatch, rest, worst
 ):
@@ -98,15 +95,12 @@ def test_courses_and_gusts_are_the_same_for_all_times_and_steps():
         assert len(found.gusts) == fine.num_timesteps + 1
 
 
-@pytest.mark.parametrize(
-    ("wave", "expected"),
-    [
-        (lambda t: np.sin(2 * np.pi * t), 2.0),  # once a second to and fro
-        (lambda t: 0.013 * (-1.0) ** np.arange(len(t)), 200.0),  # every step, as fast as it can
-        (lambda t: t + 0.009 * (-1.0) ** np.arange(len(t)), 0.0),  # within the servo's play
-        (lambda t: np.floor(t), 0.0),  # stop and go, one way
-    ],
-)
+@pytest.mark.parametrize(("wave", "expected"), [
+    (lambda t: np.sin(2 * np.pi * t), 2.0),  # once a second to and fro
+    (lambda t: 0.013 * (-1.0) ** np.arange(len(t)), 200.0),  # every step, as fast as it can
+    (lambda t: t + 0.009 * (-1.0) ** np.arange(len(t)), 0.0),  # within the servo's play
+    (lambda t: np.floor(t), 0.0),  # stop and go, one way
+])  # fmt: skip
 def test_reversals_are_counted(wave, expected):
     time = 0.005 * np.arange(2000)
     found = count_reversals(wave(time)[:, None]) / 10.0

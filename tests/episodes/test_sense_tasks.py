@@ -47,15 +47,12 @@ def test_who_starts_where_it_touches_has_found():
     assert judge("search", track(along_x(0, 5), target=along_x(0.3, 0.3))) == 1.0
 
 
-@pytest.mark.parametrize(
-    ("robot", "pursuer", "score"),
-    [
-        ((0, 0, 0, 0), (-4.5, -4.5, -4.5, -4.5), 1.0),
-        ((0, 1, 2, 3), (-4.5, -3.5, -2.5, -1.5), 1.0),  # as fast
-        ((0, 0, 0, 0), (-4.5, -2.5, -2.5, -2.5), (1 + 3 * 0.5) / 4),  # 4 m, then 2 m
-        ((0, 0, 0, 9), (-4.5, -2.5, -0.4, -0.4), (1 + 0.5) / 4),  # caught, and no way back
-    ],
-)
+@pytest.mark.parametrize(("robot", "pursuer", "score"), [
+    ((0, 0, 0, 0), (-4.5, -4.5, -4.5, -4.5), 1.0),
+    ((0, 1, 2, 3), (-4.5, -3.5, -2.5, -1.5), 1.0),  # as fast
+    ((0, 0, 0, 0), (-4.5, -2.5, -2.5, -2.5), (1 + 3 * 0.5) / 4),  # 4 m, then 2 m
+    ((0, 0, 0, 9), (-4.5, -2.5, -0.4, -0.4), (1 + 0.5) / 4),  # caught, and no way back
+])  # fmt: skip
 def test_escape_counts_the_nearest_and_how_late(robot, pursuer, score):
     given = track(along_x(*robot), target=along_x(*pursuer))
     assert judge("escape", given) == pytest.approx(score, abs=1e-6)

@@ -251,13 +251,10 @@ def test_a_target_is_recorded_as_it_is_felt(settings):
     assert score[0] == pytest.approx((away[0] - away[1]) / length, abs=0.05)
 
 
-@pytest.mark.parametrize(
-    ("name", "task", "genes"),
-    [
-        ("lake_target", "reach_target", 8 * (1 + 3 * 2 + 1 + 3) + 10 + 1),
-        ("auv_follow_bed", "follow_bed", 1 + 4 * (1 + 1 + 1 + 3 + 3 + 3)),
-    ],
-)
+@pytest.mark.parametrize(("name", "task", "genes"), [
+    ("lake_target", "reach_target", 8 * (1 + 3 * 2 + 1 + 3) + 10 + 1),
+    ("auv_follow_bed", "follow_bed", 1 + 4 * (1 + 1 + 1 + 3 + 3 + 3)),
+])  # fmt: skip
 def test_shipped_configurations_of_tasks_that_need_senses(name, task, genes):
     """Per hinge A, B and three answers to each number; per thruster B and answers; f."""
     fitness = make_fitness(name)

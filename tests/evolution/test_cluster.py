@@ -159,13 +159,10 @@ def test_workers_of_another_source_are_refused(cluster, executor, config, caplog
     assert worker.blocks == []
 
 
-@pytest.mark.parametrize(
-    ("place", "message"),
-    [
-        ("none.json", "--cluster: expected a scheduler file; found none at none.json"),
-        ("nonsense://a:1", "--cluster nonsense://a:1: expected a Dask scheduler; found "),
-    ],
-)
+@pytest.mark.parametrize(("place", "message"), [
+    ("none.json", "--cluster: expected a scheduler file; found none at none.json"),
+    ("nonsense://a:1", "--cluster nonsense://a:1: expected a Dask scheduler; found "),
+])  # fmt: skip
 def test_places_without_a_scheduler_are_one_line(config, place, message):
     check_refused(message, make_executor, config, None, toys.make_toy, place)
 

@@ -407,14 +407,11 @@ def test_a_single_command_is_a_list_of_one():
     assert run_python(make_brain_python(brain), brain, [{}]).shape == (1, 1)
 
 
-@pytest.mark.parametrize(
-    ("step", "message"),
-    [
-        (lambda p, s, t, x: (s, jnp.sort(x.angle, axis=0)), "found JAX's 'sort' in its step"),
-        (lambda p, s, t, x: (s, x.angle[(10 * t).astype(int) % 2] + x.angle), "constant places"),
-        (lambda p, s, t, x: (s, x.angle + x.noise[0]), "the simulation's sensor noise"),
-    ],
-)
+@pytest.mark.parametrize(("step", "message"), [
+    (lambda p, s, t, x: (s, jnp.sort(x.angle, axis=0)), "found JAX's 'sort' in its step"),
+    (lambda p, s, t, x: (s, x.angle[(10 * t).astype(int) % 2] + x.angle), "constant places"),
+    (lambda p, s, t, x: (s, x.angle + x.noise[0]), "the simulation's sensor noise"),
+])  # fmt: skip
 def test_what_a_file_cannot_hold_is_refused(step, message, spider):
     controller = Controller(0, (), lambda genes, plant: (), lambda parameters: (), step)
     check_refused(

@@ -45,30 +45,24 @@ def test_help_loads_nothing_heavy(name, words):
     assert words in done.stdout
 
 
-@pytest.mark.parametrize(
-    ("called", "words"),
-    [
-        ("/venv/bin/mjx-revolve", "mjx-revolve viewer"),
-        ("/lib/mjx_revolve/__main__.py", "python -m mjx_revolve viewer"),
-        ("/lib/mjx_revolve/viewer.py", "python -m mjx_revolve.viewer"),
-        ("/lib/mjx_revolve/importer.py", "python -m mjx_revolve import"),
-    ],
-)
+@pytest.mark.parametrize(("called", "words"), [
+    ("/venv/bin/mjx-revolve", "mjx-revolve viewer"),
+    ("/lib/mjx_revolve/__main__.py", "python -m mjx_revolve viewer"),
+    ("/lib/mjx_revolve/viewer.py", "python -m mjx_revolve.viewer"),
+    ("/lib/mjx_revolve/importer.py", "python -m mjx_revolve import"),
+])  # fmt: skip
 def test_commands_name_themselves_as_they_were_called(called, words, monkeypatch):
     monkeypatch.setattr(sys, "argv", [called])
     assert program(words.split("revolve")[-1].strip(" .")) == words
 
 
-@pytest.mark.parametrize(
-    ("argv", "message"),
-    [
-        (["a", "--fast"], "unrecognized arguments: --fast (see --help)"),
-        ([], "the following arguments are required: path (see --help)"),
-        (["a", "--duration", "-1"], "--duration: expected a number > 0 and <= 86400 [s]; found"),
-        (["a", "--rate", "²"], "--rate: expected a whole number from 1 to 9; found '²' (see"),
-        (["a", "--count", "9" * 5000], "--count: expected a whole number >= 1; found '999"),
-    ],
-)
+@pytest.mark.parametrize(("argv", "message"), [
+    (["a", "--fast"], "unrecognized arguments: --fast (see --help)"),
+    ([], "the following arguments are required: path (see --help)"),
+    (["a", "--duration", "-1"], "--duration: expected a number > 0 and <= 86400 [s]; found"),
+    (["a", "--rate", "²"], "--rate: expected a whole number from 1 to 9; found '²' (see"),
+    (["a", "--count", "9" * 5000], "--count: expected a whole number >= 1; found '999"),
+])  # fmt: skip
 def test_wrong_arguments_are_one_line_and_code_2(argv, message, capsys):
     parser = Parser()
     parser.add_argument("path", type=read_path)
@@ -85,15 +79,12 @@ FULL = OSError(errno.ENOSPC, "No space left on device", "a.xml")
 LARGE = RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 64 bytes.\nmore")
 
 
-@pytest.mark.parametrize(
-    ("error", "code", "line"),
-    [
-        (InputError("a.yaml: expected a file; found none"), 2, "error: a.yaml: expected a file; "),
-        (FULL, 1, "error: a.xml: No space left on device\n"),
-        (LARGE, 1, "error: too little memory: Out of memory allocating 64 bytes.\n"),
-        (KeyboardInterrupt(), 130, "interrupted\n"),
-    ],
-)
+@pytest.mark.parametrize(("error", "code", "line"), [
+    (InputError("a.yaml: expected a file; found none"), 2, "error: a.yaml: expected a file; "),
+    (FULL, 1, "error: a.xml: No space left on device\n"),
+    (LARGE, 1, "error: too little memory: Out of memory allocating 64 bytes.\n"),
+    (KeyboardInterrupt(), 130, "interrupted\n"),
+])  # fmt: skip
 def test_what_is_no_fault_of_ours_is_one_line(error, code, line, capsys):
     def main(argv):
         raise error

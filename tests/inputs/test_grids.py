@@ -40,16 +40,13 @@ def test_a_grid_has_all_combinations_by_names_that_folders_may_have():
     assert combine([], "lake_swim") == {"lake_swim": ()}
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        (["a.b"], "--set a.b: expected KEY.PATH=VALUE; found 'a.b'"),
-        (["a=1,,2"], "--set a: expected YAML values between commas; found '1,,2'"),
-        (["a=[1,2"], "expected YAML values between commas"),
-        (["a=1,2,1.0"], "--set a: expected each value once; found '1.0' twice"),
-        (["a=1", "a=2"], "--set a: expected each setting once, with commas between its values"),
-    ],
-)
+@pytest.mark.parametrize(("settings", "message"), [
+    (["a.b"], "--set a.b: expected KEY.PATH=VALUE; found 'a.b'"),
+    (["a=1,,2"], "--set a: expected YAML values between commas; found '1,,2'"),
+    (["a=[1,2"], "expected YAML values between commas"),
+    (["a=1,2,1.0"], "--set a: expected each value once; found '1.0' twice"),
+    (["a=1", "a=2"], "--set a: expected each setting once, with commas between its values"),
+])  # fmt: skip
 def test_what_is_no_grid_is_refused_in_one_line(settings, message):
     check_refused(message, read_axes, settings)
 

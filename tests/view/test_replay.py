@@ -412,13 +412,10 @@ def test_page_alone_needs_no_opengl(command, tmp_path, monkeypatch):
     assert (tmp_path / "page.html").exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--size", "0x0"), "from 64x64 to 3840x2160; found '0x0'"),
-        (("--html", "--out", "x.mp4"), "with --html"),
-    ],
-)
+@pytest.mark.parametrize(("words", "message"), [
+    (("--size", "0x0"), "from 64x64 to 3840x2160; found '0x0'"),
+    (("--html", "--out", "x.mp4"), "with --html"),
+])  # fmt: skip
 def test_wrong_options(words, message, tmp_path, capsys):
     (tmp_path / "spider.yaml").touch()
     assert run_command(replay.main, [str(tmp_path / "spider.yaml"), *words]) == 2

@@ -456,15 +456,12 @@ def test_a_page_about_what_is_left(copy, quick, capsys):
     assert "found 1" in page.text  # c: one gene where three are expected
 
 
-@pytest.mark.parametrize(
-    ("argv", "message"),
-    [
-        (["nowhere"], "nowhere: expected a run folder; found none"),
-        (["run", "run/../run"], "run/../run: expected each run once; found it as run, too"),
-        (["run", "--out", "no/page.html"], "--out no/page.html: expected the folder no; found"),
-        (["run"], "run/report.html: expected no file or an earlier report; found another file"),
-    ],
-)
+@pytest.mark.parametrize(("argv", "message"), [
+    (["nowhere"], "nowhere: expected a run folder; found none"),
+    (["run", "run/../run"], "run/../run: expected each run once; found it as run, too"),
+    (["run", "--out", "no/page.html"], "--out no/page.html: expected the folder no; found"),
+    (["run"], "run/report.html: expected no file or an earlier report; found another file"),
+])  # fmt: skip
 def test_wrong_commands(copy, argv, message, capsys):
     (copy.parent / "empty").mkdir()
     (copy / "report.html").write_text("mine")

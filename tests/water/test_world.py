@@ -237,15 +237,12 @@ def test_relative_paths_start_where_they_are_written(tmp_path, monkeypatch):
 GRID = "expected one row for each of 3 x 2 x 2 points of a full grid"
 
 
-@pytest.mark.parametrize(
-    ("lines", "message"),
-    [
-        (["x,y,z,u,v"], "line 1: expected columns x, y, z, u, v, w; found no w"),
-        (["x,y,z,u,v,w", "1,2,3,4,5,fast"], "line 2: expected a number; found 'fast'"),
-        (["x,y,z,u,v,w", *table()[1:]], f"{GRID}; found 11 rows"),
-        (["x,y,z,u,v,w", *table(), table()[5]], f"{GRID}; found (1, -1, -1) twice"),
-    ],
-)
+@pytest.mark.parametrize(("lines", "message"), [
+    (["x,y,z,u,v"], "line 1: expected columns x, y, z, u, v, w; found no w"),
+    (["x,y,z,u,v,w", "1,2,3,4,5,fast"], "line 2: expected a number; found 'fast'"),
+    (["x,y,z,u,v,w", *table()[1:]], f"{GRID}; found 11 rows"),
+    (["x,y,z,u,v,w", *table(), table()[5]], f"{GRID}; found (1, -1, -1) twice"),
+])  # fmt: skip
 def test_wrong_tables(tmp_path, lines, message):
     path = tmp_path / "flow.csv"
     path.write_text("\n".join(lines))
