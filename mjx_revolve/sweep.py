@@ -98,7 +98,7 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
 
     sweep = Sweep(str(path), arguments.seeds, tuple(arguments.settings), arguments.first_seed)
     folder = Path(arguments.out) if arguments.out else _usual_folder(sweep)
-    check_folder(folder)
+    check_folder(folder, sweep)
     default_page(folder)  # refuses now what it would refuse after days
     steps = choose_steps(sweep.plans(folder.absolute()), make_fitness, arguments.trust)
     write_sweep(folder, sweep)

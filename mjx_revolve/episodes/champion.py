@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -149,13 +149,19 @@ def load_asked(arguments: argparse.Namespace) -> Episode:
         return load_episode(a.path, a.world, a.duration, a.seed, a.individual, a.modules)
 
 
-def _settings(duration: float | None) -> dict[str, float | None]:
+def _load_config(load: Callable[..., Config], duration: float | None) -> Config:
+    """A configuration, for so long."""
+    config = load()
+    if duration is None:
+        return config
+    if not duration > (settle := config.task.settle):
+        raise InputError("--duration", f"more than task.settle ({settle:g} s)", f"{duration:g}")
     # What swims longer than its horizon needs none.
-    return {} if duration is None else {"task.duration": float(duration), "task.horizon": None}
+    return load(**{"task.duration": float(duration), "task.horizon": None})
 
 
 def _champion(champion: ChampionRecord, duration: float | None, seed: int | None) -> Episode:
-    config = champion.load_config(**_settings(duration))
+    config = _load_config(champion.load_config, duration)
     fitness = make_fitness(config)
     champion.check_genes(fitness.num_genes, Path(config.source).name)
     key = _key(config, seed)
@@ -222,7 +228,7 @@ def read_individuals(
         InputError: the run evolves no bodies, or has no such individual.
     """
     folder = find_run(path)
-    config = RunReader(folder).load_config(**_settings(duration))
+    config = _load_config(RunReader(folder).load_config, duration)
     if config.bodies is None:
         many = "a run in which bodies evolve, to show one of many"
         raise InputError(folder, many, "one in which only genes do")

@@ -7,6 +7,7 @@ values, so that a run folder documents itself.
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import math
 import os
@@ -280,7 +281,7 @@ class TaskConfig(Section):
     all [m]."""
     energy_weight: Annotated[NonNegative, Unit("1/J")] = 0.0
     """Score lost per joule of work of servos and propellers, summed without sign [1/J]."""
-    start_tilt: Annotated[NonNegative, Unit("rad")] = 0.1
+    start_tilt: Annotated[NonNegative, Le(math.pi), Unit("rad")] = 0.1
     """Standard deviation of the start's roll and pitch [rad]."""
     start_attitude: Literal["level", "righted"] = "level"
     """Attitude of the core before the tilt: `level`, or `righted`, the body's equilibrium in deep
@@ -646,6 +647,8 @@ def load_config(path: str | Path, overrides: Mapping[str, object] | Sequence[str
         raise InputError(short_path(path), "a mapping of settings", found)
     if "body" in data and "task" not in data:
         raise InputError(short_path(path), "a configuration", "a robot")
+    if data and set(data) <= {field.name for field in dataclasses.fields(World)}:
+        raise InputError(short_path(path), "a configuration", "a world")
     if is_run_config(path):
         data = locate_files(data, find_copies(Path(os.path.abspath(path.parent))))
         data = with_older_values(data, path.parent)

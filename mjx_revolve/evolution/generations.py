@@ -232,7 +232,8 @@ def choose_candidate(
     means = fresh(range(len(eligible)), CHOOSE_STREAM, CHOOSE_EPISODES)[0].mean(axis=0)
     order = np.argsort(-np.where(eligible, means, -np.inf), kind="stable")
     if not np.any(means[eligible] > FAILED_SCORE):
-        raise InputError("champion", "a score of any candidate", "none: all failed")
+        why = "none: all failed (not finite, or too fast: are units and timestep right?)"
+        raise InputError("champion", "a score of any candidate", why)
     winner, passport = int(order[0]), None
     if judge is not None:
         passport = judge(winner)

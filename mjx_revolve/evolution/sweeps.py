@@ -33,7 +33,7 @@ from mjx_revolve.evolution.run import MakeExecutor, Run, check_search, check_unc
 from mjx_revolve.evolution.run_folder import RunFolder, is_new_folder, open_run_folder
 from mjx_revolve.evolution.tensorboard import check_tensorboard
 from mjx_revolve.inputs.commands import check_output_folder, describe_refusal
-from mjx_revolve.inputs.errors import InputError, reading
+from mjx_revolve.inputs.errors import InputError, note, reading
 from mjx_revolve.inputs.files import SWEEP, short_path, write_atomic
 from mjx_revolve.inputs.grids import MOST_SEEDS, combine, read_axes
 from mjx_revolve.inputs.overrides import read_overrides, sets
@@ -194,9 +194,16 @@ def read_sweep(folder: str | Path) -> Sweep:
     return sweep
 
 
-def check_folder(folder: Path) -> None:
-    """Raises `InputError` for a folder that is not new, empty or a sweep's; see `next_step`."""
+def check_folder(folder: Path, sweep: Sweep) -> None:
+    """Raises `InputError` for a folder that is not new, empty or a sweep's; see `next_step`.
+
+    A note names cases of the folder that the sweep has no more: they will be in no report.
+    """
     check_output_folder(folder)
+    if (folder / SWEEP).is_file():
+        others = [x for x in read_sweep(folder).cases if x not in sweep.cases]
+        if left := [name for name in others if (folder / name).is_dir()]:
+            note(f"{folder}: runs of {', '.join(left)} stay, but are no part of this sweep")
     if not (folder / SWEEP).is_file() and folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"--out {folder}", "a new or empty folder, or that of a sweep", "files")
 

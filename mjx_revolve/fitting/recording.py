@@ -35,6 +35,7 @@ _PLACE = ("x", "y", "z")
 _SENSED = tuple(f"{kind}.{axis}" for kind in ("gyro", "accel") for axis in "xyz")
 _SIGNAL = re.compile("|".join([*map(re.escape, ("time", *_POSE, *_SENSED)),
                                r"mark\..+\.[xyz]", r"(command|angle)\..+"]))  # fmt: skip
+_KNOWN = "the name of a signal, such as time, x, yaw, depth, mark.NAME or command.MODULE"
 _SOURCE = re.compile(r"^(?P<column>.*?)(?:\*(?P<factor>[-+0-9.eE]+))?$", re.DOTALL)
 # Faster than any robot of modules swims [body lengths/s]; wrong units are beyond it. A choice.
 _FASTEST = 30.0
@@ -44,6 +45,8 @@ _FASTEST_TURN = 4 * math.pi
 _STAYS = 5
 # Commands are sampled, and not as sent, where this share of them is of frames and is new. A choice.
 _SAMPLED = 0.6
+# Robots are filmed faster than with a frame in so long [s]; numbers of frames are not. A choice.
+_SLOW = 0.5
 GAP = 2.5
 """A gap is longer than so many usual frames; one of two is a dropped frame. A choice."""
 
@@ -107,6 +110,9 @@ def read_map(options: Sequence[str], label: str = "--map") -> dict[str, str]:
         data = load_yaml(option)
         if not isinstance(data, dict):
             raise InputError(option, "a mapping of names to columns", show(data))
+        for key in map(str, data):
+            if not _SIGNAL.fullmatch(key) and not key.startswith("mark.") and key not in _TYPES:
+                raise InputError(f"{option}: {key}", _KNOWN, "a key of no meaning")
         found |= {str(key): str(value) for key, value in data.items()}
     return found
 
@@ -135,9 +141,12 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
     unused: list[str] = []
     run = path.is_dir() and (path / "run.json").is_file()
     bag = not run and (path.is_dir() or path.suffix in (".mcap", ".db3"))
+    if path.is_dir() and not run and not (path / "metadata.yaml").is_file():
+        both = "a ROS 2 bag or a run folder"
+        raise InputError(path, both, "a folder with neither metadata.yaml nor run.json")
     for name in rest:
         if not _SIGNAL.fullmatch(name) and not (bag and name in _TYPES):
-            raise InputError(f"--map {name}", "the name of a signal", show(name))
+            raise InputError(f"--map {name}", _KNOWN, show(name))
     notes: list[str] = []
     with reading(path):
         if run:
@@ -576,7 +585,13 @@ def _check_signals(signals: Mapping[str, TimeSeries], robot: Robot) -> list[str]
     if most < 3 and "mean_speed" not in signals:
         raise InputError(f"expected three frames or more; found {most}")
     _check_motion(signals, robot)
-    return [*_gaps(frames), *_sampled_commands(signals, frames, robot)]
+    notes = [*_gaps(frames), *_sampled_commands(signals, frames, robot)]
+    every = [(float(np.median(np.diff(s.time))), s.time) for s in frames.values() if most > 2]
+    if every and (slow := min(every, key=lambda row: row[0]))[0] > _SLOW:
+        rate, span = 1 / slow[0], slow[1][-1] - slow[1][0]
+        notes.append(f"{rate:.2g} frames a second, {span:.0f} s in all: is time in seconds (--map "
+                     "time=COLUMN*FACTOR)?")  # fmt: skip
+    return notes
 
 
 def _check_motion(signals: Mapping[str, TimeSeries], robot: Robot) -> None:
