@@ -425,8 +425,8 @@ def trim_neutral(morphology: Morphology, density: float) -> Morphology:
         )
     if total > morphology.box_volume:  # a choice: no electronics are larger than their robot
         note(
-            f"{morphology.path or morphology.name}: trimmed by {1e6 * total:.4g} cm3, its boxes have "
-            f"{1e6 * morphology.box_volume:.4g} in all: are masses in kg, and is {density:g} "
+            f"{morphology.path or morphology.name}: trimmed by {1e6 * total:.4g} cm3, its boxes "
+            f"have {1e6 * morphology.box_volume:.4g} in all: are masses in kg, and is {density:g} "
             "kg/m3 the water's density?"
         )
     added = {"electronics_volume": max(total, 0.0)}
