@@ -6,11 +6,11 @@ Error: the distance between an episode's end and its end with converged steps (t
 median over individuals, over the median way swum. Work: robot seconds per second of process CPU
 time, all engines in one process and measured in turn, so that other programs on the machine do not
 count; of each engine at its shortest step and at the longest that does not blow up, and of those
-between by a line in 1 / step. Engines in one water are given the same commands, those of our
-controller. Ours is held against a reference of its own, with a quarter of the shortest step; MuJoCo
-C's integrators against its RK4 with the same: joint limits are springs there and constraints here.
-`--only` measures some cases; with `--results` theirs replace those in docs/results/precision.json,
-from where docs/precision.png and docs/performance.md have them.
+between by a line in 1 / step, beyond by 1 / step. Engines in one water are given the same commands,
+those of our controller. Ours is held against a reference of its own, with a quarter of the shortest
+step; MuJoCo C's integrators against its RK4 with the same: joint limits are springs there and
+constraints here. `--only` measures some cases; with `--results` theirs replace those in
+docs/results/precision.json, from where docs/precision.png and docs/performance.md have them.
 """
 
 from __future__ import annotations
@@ -495,12 +495,16 @@ def cost_of(steps: Sequence[float], seconds: Sequence[float]) -> Callable[[float
     """CPU seconds per robot second over the step, from those of one or two steps.
 
     A step costs as long whatever its length; commands, records and episodes cost what they do per
-    robot second: a line in 1 / step.
+    robot second: a line in 1 / step. Beyond the longest of two, all of it goes as 1 / step.
     """
-    if len(steps) == 1:
-        return lambda step: seconds[0] * steps[0] / step
-    each = (seconds[0] - seconds[1]) / (1 / steps[0] - 1 / steps[1])
-    return lambda step: seconds[0] + each * (1 / step - 1 / steps[0])
+
+    def cost(step: float) -> float:
+        if step >= steps[-1]:
+            return seconds[-1] * steps[-1] / step
+        each = (seconds[0] - seconds[-1]) / (1 / steps[0] - 1 / steps[-1])
+        return seconds[0] + each * (1 / step - 1 / steps[0])
+
+    return cost
 
 
 def run_case(case: Case, sizes: Sizes) -> list[dict[str, Any]]:
