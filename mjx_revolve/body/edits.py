@@ -408,7 +408,5 @@ def _finish(
         still = {m.name for m in modules} - {modules[i].name for i in moved}
         old = (pair for pair in body.overlaps if still.issuperset(pair))
         pairs = tuple(sorted({*pairs, *old}, key=lambda pair: [number[name] for name in pair]))
-    names, sensors = {module.name for module in modules}, body.sensors
-    if sensors:  # of a module that is gone, its sensor is, too
-        sensors = tuple(s for s in sensors if s.at is None or s.at in names)
-    return replace(body, modules=tuple(modules), overlaps=pairs, sensors=sensors, path=None)
+    edited = replace(body, modules=tuple(modules), overlaps=pairs, path=None)
+    return edited.with_sensors(body.sensors)

@@ -73,10 +73,12 @@ def exposure(parts: RestPose) -> Exposure:
         within = _spans(parts, part, center, reach)
         beside = np.array(_BESIDE)[axis]
         hits = _rectangles(within[pair, beside[:, 0]], within[pair, beside[:, 1]])
-        # What a thin plate is mounted on is near its free face, too, but lies behind the other.
+        # What a thin plate is mounted on is near its free face, too, but lies behind the other and
+        # ends short of it.
         ends = np.stack([-parts.low, parts.high])[side, part[pair], axis]
         out = np.where(side, center[pair, axis], -center[pair, axis])
         behind = thin[part[pair], axis] & (out < ends - (parts.high - parts.low)[part[pair], axis])
+        behind &= out + reach[pair, axis] < ends
         hits = np.where(behind[:, None], np.uint32(0), hits)
         face = (part[pair] * 2 + side) * 3 + axis
         start = np.flatnonzero(np.append(True, np.diff(face)))
@@ -90,8 +92,9 @@ def exposure(parts: RestPose) -> Exposure:
         low, high = parts.low[part[k]], parts.high[part[k]]
         grid = low + ((np.arange(_POINTS) + 0.5) / _POINTS)[:, None] * (high - low)
         for side, axis in np.ndindex(2, 3):
-            behind = center[k, axis] < low[axis] if side else center[k, axis] > high[axis]
-            if thin[part[k], axis] and behind:
+            out = center[k, axis] if side else -center[k, axis]
+            near, far = (low[axis], high[axis]) if side else (-high[axis], -low[axis])
+            if thin[part[k], axis] and out < near and out + reach[k, axis] < far:
                 continue
             one, two = _BESIDE[axis]
             points = np.empty((len(_DISTANCES), _POINTS, _POINTS, 3))

@@ -423,12 +423,6 @@ def trim_neutral(morphology: Morphology, density: float) -> Morphology:
             f"modules displace {-total:.4g} m3 too much (params: ballast of "
             f"{-total * density:.4g} kg would do)"
         )
-    if total > morphology.box_volume:  # a choice: no electronics are larger than their robot
-        note(
-            f"{morphology.path or morphology.name}: trimmed by {1e6 * total:.4g} cm3, its boxes "
-            f"have {1e6 * morphology.box_volume:.4g} in all: are masses in kg, and is {density:g} "
-            "kg/m3 the water's density?"
-        )
     added = {"electronics_volume": max(total, 0.0)}
     core = replace(core, kind=apply_overrides(core.kind, added), params={**core.params, **added})
     return replace(morphology, modules=(core, *morphology.modules[1:]))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -48,6 +48,12 @@ class Morphology:
     path: str | None = None
     overlaps: tuple[tuple[str, str], ...] = ()
     sensors: tuple[Sensor, ...] | None = None
+
+    def with_sensors(self, sensors: tuple[Sensor, ...] | None) -> Morphology:
+        """The same with sensors, but for those at modules that it lacks."""
+        names = {module.name for module in self.modules}
+        kept = (one for one in sensors or () if one.at is None or one.at in names)
+        return replace(self, sensors=None if sensors is None else tuple(kept))
 
     def __eq__(self, other: object) -> bool:
         """Same name, modules, brain and sensors; the path does not count."""

@@ -21,11 +21,15 @@ _FIXED = (
     *("jnt_stiffness", "dof_frictionloss", "actuator_gear", "qpos_spring", "body_gravcomp"),
     *("jnt_actfrclimited", "jnt_actfrcrange", "actuator_dyntype", "actuator_gaintype"),
     # What our step takes from the robot.
-    *("qpos0", "actuator_trnid", "actuator_biastype", "jnt_type", "site_pos"),
+    *("qpos0", "actuator_trnid", "actuator_biastype", "jnt_type"),
     *("jnt_stiffnesspoly", "dof_dampingpoly"),  # of newer MuJoCo
 )
-# What it must leave as it is of a thruster.
+# What it must leave as it is of a thruster, and of the site where it pushes.
 _THRUST = ("dynprm", "gainprm", "ctrlrange", "ctrllimited", "forcerange", "forcelimited")
+_SITE = ("pos", "quat", "bodyid")
+# Numbers that must be finite: any, above 0, and not below 0.
+_ANY = ("body_ipos", "body_iquat", "actuator_gainprm", "actuator_biasprm")
+_POSITIVE, _NOT_NEGATIVE = ("body_mass", "body_inertia"), ("dof_armature", "dof_damping")
 _COUNTS = ("nbody", "nq", "nv", "nu", "neq", "ntendon")
 
 
@@ -51,24 +55,30 @@ def check_edit(model: mujoco.MjModel, built: mujoco.MjModel, name: str) -> None:
         pairs += [(x, getattr(model, x)[:, part], getattr(built, x)[:, part]) for x, part in
                   (("actuator_biasprm", 0), ("actuator_gainprm", slice(1, None)))]  # fmt: skip
         thrust = built.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE
-        pairs += [(f"{x} of a thruster", *(getattr(m, f"actuator_{x}")[thrust]
-                  for m in (model, built))) for x in _THRUST]  # fmt: skip
+        at = built.actuator_trnid[thrust, 0]
+        parts = [(f"actuator_{x}", thrust) for x in _THRUST] + [(f"site_{x}", at) for x in _SITE]
+        pairs += [(f"{x} of a thruster", *(getattr(m, x)[part] for m in (model, built)))
+                  for x, part in parts]  # fmt: skip
         changed = [x for x, new, old in pairs if not np.allclose(new, old, atol=1e-9)]
     if changed:
         expected = "other masses, inertias, hinges or servos only"
         found = f"another {', '.join(changed)} (edit the morphology or the world instead)"
         raise InputError(f"model of {name!r}", expected, found)
-    positive = [(x, getattr(model, x)[1:] > 0) for x in ("body_mass", "body_inertia")]
-    least = [(x, getattr(model, x) >= 0) for x in ("dof_armature", "dof_damping")]
-    for x, fits in (*positive, *least):
-        if not np.all(fits & (getattr(model, x)[-len(fits) :] < np.inf)):
-            sign = ">= 0" if x.startswith("dof") else "> 0"
-            found = getattr(model, x).ravel().tolist()
-            raise InputError(f"model of {name!r}: {x}", f"finite numbers {sign}", show(found))
-    low, high = model.jnt_range[model.jnt_limited.astype(bool)].T
-    if not np.all(low < high):
-        raise InputError(f"model of {name!r}: jnt_range", "the lowest below the highest",
-                         show(model.jnt_range.tolist()))  # fmt: skip
+    for x in (*_ANY, *_POSITIVE, *_NOT_NEGATIVE):
+        numbers = getattr(model, x)
+        fits, wanted = np.isfinite(numbers).all(), "finite numbers"
+        if x in _POSITIVE:  # the world, the first body, has none
+            fits, wanted = fits and (numbers[1:] > 0).all(), f"{wanted} > 0"
+        elif x in _NOT_NEGATIVE:
+            fits, wanted = fits and (numbers >= 0).all(), f"{wanted} >= 0"
+        if not fits:
+            raise InputError(f"model of {name!r}: {x}", wanted, show(numbers.ravel().tolist()))
+    limits = {"jnt_range": "jnt_limited", "actuator_forcerange": "actuator_forcelimited"}
+    for x, limited in limits.items():
+        low, high = getattr(model, x)[getattr(model, limited).astype(bool)].T
+        if not np.all(low < high):
+            found = show(getattr(model, x).tolist())
+            raise InputError(f"model of {name!r}: {x}", "the lowest below the highest", found)
 
 
 def edited_assembly(assembly: Assembly, model: mujoco.MjModel, servos: Sequence[int]) -> Assembly:

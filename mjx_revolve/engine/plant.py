@@ -97,9 +97,10 @@ def body_geometries(assembly: Assembly) -> BodyGeometry:
 def least_lift(world: World) -> float:
     """Share of its weight that the water must carry so that a body sinks no faster than it swims.
 
-    Where nothing drags, whatever is heavier than the water falls freely.
+    Where nothing drags, whatever is heavier than the water falls freely; neutral to rounding, as
+    from `trim_neutral`, counts as neutral.
     """
-    return 1.0 if world.drag in ("off", "fossen") else 0.5
+    return 1 - 1e-6 if world.drag in ("off", "fossen") else 0.5
 
 
 def stretched_lengths(assembly: Assembly) -> np.ndarray:

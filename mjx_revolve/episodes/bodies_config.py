@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 
 from mjx_revolve.episodes.settings import File, Settings, one_of
 from mjx_revolve.genotypes.table import GENOTYPES
+from mjx_revolve.inputs.errors import note
 from mjx_revolve.inputs.schema import (
     ConstraintError,
     Integer,
@@ -135,15 +136,8 @@ class ArchiveConfig(Settings):
         cells = math.prod(axis.cells for axis in self.axes.values())
         if self.type == "grid" and cells > _MOST_CELLS:
             raise ConstraintError("axes", f"at most {_MOST_CELLS:,} cells", f"{cells:,}")
-        own = {"cells": (self, "cvt", "a grid has those of its axes")} | {
-            f"axes.{name}.cells": (axis, "grid", "cvt has archive.cells")
-            for name, axis in self.axes.items()
-        }
-        for place, (section, kind, instead) in own.items():
-            usual = type(section).model_fields["cells"].default
-            if self.type != kind and section.cells != usual:
-                what = f"{usual}, as only {kind} has it ({instead})"
-                raise ConstraintError(place, what, section.cells)
+        if self.type == "grid" and self.cells != type(self).model_fields["cells"].default:
+            note(f"bodies.archive.cells is of cvt: the grid has {cells:,} by its axes")
         return self
 
 

@@ -55,7 +55,7 @@ from mjx_revolve.episodes.scoring import average_trials, list_episodes, max_dist
 from mjx_revolve.episodes.simulate import Trajectory, simulate
 from mjx_revolve.episodes.starts import Starts, episode_context, target_path
 from mjx_revolve.episodes.tasks import TASKS, Task, find_task, start_above_bed, start_at_depth
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, note
 from mjx_revolve.numerics.xla import materialize, over_chunks
 from mjx_revolve.water.bed import bed_height
 from mjx_revolve.water.drag import DRAG_LAWS, find_drag_law
@@ -708,6 +708,13 @@ def _build(config: Config, world: World, morphology: Morphology) -> Robot:
             none = "none, as water of density 0 carries nothing"
             raise InputError(f"{config.source}: trim", none, "neutral")
         morphology = trim_neutral(morphology, world.density)
+        added = sum(part.electronics_volume for part in morphology.modules[0].kind.parts)
+        if added > (boxes := morphology.box_volume):  # no electronics are larger than their robot
+            note(
+                f"{config.source}: trim: neutral with {1e6 * added:.4g} cm3 in the core, and all "
+                f"boxes have {1e6 * boxes:.4g}: are masses in kg, and is {world.density:g} kg/m3 "
+                "the water's density?"
+            )
     return build_robot(morphology, world)
 
 

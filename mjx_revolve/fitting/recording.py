@@ -586,9 +586,10 @@ def _check_signals(signals: Mapping[str, TimeSeries], robot: Robot) -> list[str]
         raise InputError(f"expected three frames or more; found {most}")
     _check_motion(signals, robot)
     notes = [*_gaps(frames), *_sampled_commands(signals, frames, robot)]
-    every = [(float(np.median(np.diff(s.time))), s.time) for s in frames.values() if most > 2]
-    if every and (slow := min(every, key=lambda row: row[0]))[0] > _SLOW:
-        rate, span = 1 / slow[0], slow[1][-1] - slow[1][0]
+    times = [signal.time for signal in frames.values() if len(signal.time) > 2]
+    every = [(float(np.median(np.diff(time))), time[-1] - time[0]) for time in times]
+    if every and min(every)[0] > _SLOW:
+        rate, span = 1 / min(every)[0], min(every)[1]
         notes.append(f"{rate:.2g} frames a second, {span:.0f} s in all: is time in seconds (--map "
                      "time=COLUMN*FACTOR)?")  # fmt: skip
     return notes

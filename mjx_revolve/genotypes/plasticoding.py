@@ -21,7 +21,6 @@ so that a rule can describe any body.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -249,7 +248,7 @@ def draw_sentence(
             turtle.mount(letters[letter])
         elif letter.startswith("#"):
             turtle.spell(letter[1:])
-    return replace(turtle.growth.finish(name), sensors=seed.sensors if seed else None)
+    return turtle.growth.finish(name).with_sensors(seed.sensors if seed else None)
 
 
 class _Turtle:

@@ -63,8 +63,6 @@ def test_defaults(folder):
          "9999}}}}", "--set bodies.archive.axes: expected at most 10,000,000 cells; found 99,98"),
 ("bodies={selection: {type: map_elites, objectives: [-mass]}, archive: {axes: {a: {low: 0, "
          "high: 1}, b: {low: 0, high: 1}}}}", "bodies.selection.objectives: expected score, as"),
-("bodies={archive: {cells: 9, axes: {a: {low: 0, high: 1}, b: {low: 0, high: 1}}}}",
-         "bodies.archive.cells: expected 256, as only cvt has it (a grid has those of"),
 ("task.durtion=5", "--set task.durtion: expected one of 32 keys; found an unknown key; "
          "did you mean task.duration?"),
 ("task.depth_tol=1", "; did you mean task.depth_tolerance?"),
