@@ -140,6 +140,9 @@ def test_work_at_an_error_lies_between_the_steps():
     assert precision.work_at(points, 5.0) == 400  # no step is so bad
     assert precision.work_at(points, 0.1) is None
     assert precision.work_at([{**points[0], "error_percent": None}, *points[1:]], 2.0) == 200
+    assert precision.timed_steps({0.02: None, 0.01: 5.0, 0.002: 0.1}) == [0.002, 0.01]
+    cost = precision.cost_of([0.002, 0.01], [2 + 5, 2 + 1])  # 2 s, and .01 s each step
+    assert [cost(step) for step in (0.002, 0.005, 0.01, 0.02)] == pytest.approx([7, 4, 3, 1.5])
 
 
 @pytest.mark.slow
