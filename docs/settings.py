@@ -52,8 +52,9 @@ says what was expected.
 _FAILED = """Frames are those of `docs/glossary.md`; heights are those of the robot's `point`.
 
 A rollout that is no longer finite counts as blown up, with a score of -1000; so does one that gets
-farther from its start than √(9 + F) m/s (F the thrusters' newtons), the fall of what sinks and the
-water's own velocity can carry it (currents, shear, field and gusts; waves go round)."""
+farther from its start than a robot could in the episode: at √(9 + F) m/s (F the thrusters' newtons)
+and the water's own velocity (currents, shear, field and gusts; waves go round), with its length
+and, if it sinks, its free fall."""
 
 
 def meanings(kind: type) -> dict[str, str]:
