@@ -5,7 +5,7 @@ plant; the same controller drives one robot or many different ones. The genes ar
 numbers, mapped to physical ranges by sin(gene), so that any optimiser can change them freely. A
 periodic map is used rather than a sigmoid: with tanh, an optimum at the end of a range is at
 infinity, and strategies that adapt their step size follow it until numbers overflow. With genes of
-zero no joint moves.
+zero no joint moves but to the middle of its range.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ from mjx_revolve.numerics.spatial import Scalar
 
 # How long commands take to fade in, so that no joint jumps at the start [s]; a choice.
 _FADE = 0.5
+# What an input's name ought to be.
+_UNLIKE = "names that no other input of the network has"
 
 StepOutput = tuple[PyTree, jax.Array]
 """State and commands after a controller's step."""
@@ -123,6 +125,9 @@ class GeneBlocks:
 
     def __init__(self, plant: Plant, *blocks: tuple[str, str]) -> None:
         self.blocks = blocks
+        names = [what for what, _ in blocks]
+        if twice := [what for k, what in enumerate(names) if what in names[:k]]:
+            raise InputError("controller.sensors", _UNLIKE, f"two genes {twice[0]}")
         sizes = {"hinge": plant.num_hinges, "thruster": plant.num_thrusters}
         self._sizes = sizes | {"pair": plant.num_pairs, "robot": 1}
 
@@ -154,14 +159,10 @@ class GeneBlocks:
             count = hinges + thrusters if place == "actuator" else self._sizes[place]
             own = values[start : start + count]
             start += count
-            if place == "actuator":
-                own = plant.arrange(own)
-            elif place == "hinge":
-                none = jnp.zeros((thrusters, *own.shape[1:]), own.dtype)
-                own = plant.arrange(jnp.concatenate([own, none]))[:rows]
-            elif place == "thruster":
-                none = jnp.zeros((hinges, *own.shape[1:]), own.dtype)
-                own = plant.arrange(jnp.concatenate([none, own]))[rows:]
+            if place in ("actuator", "hinge", "thruster"):
+                around = hinges * (place == "thruster"), thrusters * (place == "hinge")
+                own = plant.arrange(jnp.pad(own, (around, *[(0, 0)] * (own.ndim - 1))))
+                own = {"hinge": own[:rows], "thruster": own[rows:]}.get(place, own)
             found[what] = own
         return found
 
@@ -217,6 +218,5 @@ def gene_indices(own: Controller, common: Controller) -> np.ndarray:
     place = {gene: k for k, gene in enumerate(common.genes)}
     if len(place) < len(common.genes):
         twice = next(gene for k, gene in enumerate(common.genes) if place[gene] > k)
-        known = "names that no other input of the network has"
-        raise InputError("controller.sensors", known, f"two genes {twice.what}")
+        raise InputError("controller.sensors", _UNLIKE, f"two genes {twice.what}")
     return np.array([place[gene] for gene in own.genes], int)

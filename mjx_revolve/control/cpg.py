@@ -14,6 +14,7 @@ from mjx_revolve.control.controller import (
     GeneBlocks,
     StepOutput,
     as_plant,
+    fade_in,
     make_controller,
 )
 from mjx_revolve.control.neighbours import NeighbourMatrix, apply_matrix, pair_matrix
@@ -68,7 +69,8 @@ def make_cpg(body: Plant | Robot, max_frequency: float = 2.0, amplitude: float =
         state = jnp.concatenate(before)
         after = tuple(jnp.split(apply_matrix(turn, state) if turn else state, 2))
         # Without a rate, as in older versions, a command is that of the next step.
-        targets = center + reach * jnp.tanh((after if made_for.rate is None else before)[0])
+        wave = jnp.tanh((after if made_for.rate is None else before)[0])
+        targets = fade_in(time) * center + reach * wave
         if not constant.shape[0]:
             return after, targets
         return after, jnp.concatenate([targets, constant])

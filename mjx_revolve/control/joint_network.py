@@ -188,7 +188,8 @@ def make_joint_network(
         share = lag_share(made_for, _MESSAGE_LAG)
         fresh = [sum(message[k, m] * h[k][:rows] for k in range(hidden)) for m in range(len(sent))]
         sent = tuple(old + share * (new - old) for old, new in zip(sent, fresh, strict=True))
-        return (samples, sent, memory), middle + fade_in(time) * reach * jnp.tanh(command)
+        fade = fade_in(time)
+        return (samples, sent, memory), fade * middle + fade * reach * jnp.tanh(command)
 
     found = make_controller(made_for, genes, decode, init, step)
     return found._replace(signals=observer.signals, observer=observer)

@@ -74,7 +74,7 @@ class Observer:
     def __post_init__(self) -> None:
         """Refuses a delay that is longer than the samples that are kept."""
         for k, sensor in enumerate(self.sensors):
-            if self._kept(sensor) > _MAX_KEPT:
+            if self._kept(sensor) > 1 + _MAX_KEPT:
                 rate = self._rate(sensor)
                 most = f"at most {_MAX_KEPT / rate:g} s at {rate:g} Hz"
                 raise InputError(f"sensors.{k}.delay", most, f"{sensor.delay:g}")

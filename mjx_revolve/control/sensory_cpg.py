@@ -16,6 +16,7 @@ from mjx_revolve.control.controller import (
     GeneBlocks,
     StepOutput,
     as_plant,
+    fade_in,
     lag_share,
     make_controller,
 )
@@ -49,9 +50,11 @@ def make_sensory_cpg(
         ṙ_i = a (A_i + gain Σ_k R_ik s_k - r_i),   ȯ_i = a (B_i + gain Σ_k O_ik s_k - o_i),
 
     with s the observation, φ_ij = -φ_ji, and both sums clipped to ±1. Target of hinge i: middle +
-    amplitude × half range × clip(o_i + r_i sin θ_i, ±1). All states start at 0, so no joint jumps,
-    and with zero genes nothing moves. Thrusters have o only, and only observations of the robot as
-    a whole.
+    amplitude × half range × clip(o_i + r_i sin θ_i, ±1). All states start at 0, and the
+    middle fades in, so with zero genes nothing moves but to there. A command has the phases of its
+    time, and the r and o that the lag reaches a period later: a reflex answers at once, and the
+    first command is that far on its way (a period of 50 ms: 22 %). Thrusters have o only, and only
+    observations of the robot as a whole.
 
     Args:
         body: a plant or a robot.
@@ -105,6 +108,7 @@ def make_sensory_cpg(
         parameters: PyTree, state: PyTree, time: jax.Array, sense: SensorReadings
     ) -> StepOutput:
         waves, offsets, rate, near, (reach, middle), number = parameters
+        center = fade_in(time) * middle
         (size, on_phase, on_size), (bias, on_offset, on_bend) = waves, offsets
         samples, oscillators, offset = state
         samples, observation = observer.observe(samples, time, sense, number)
@@ -118,7 +122,7 @@ def make_sensory_cpg(
         aim = bias + respond(on_offset, inputs[:few])
         if not oscillators:
             offset = offset + follow * (jnp.clip(aim, -1, 1) - offset)
-            return (samples, (), offset), middle + reach * jnp.clip(offset, -1, 1)
+            return (samples, (), offset), center + reach * jnp.clip(offset, -1, 1)
         phase, swing = oscillators
         rows = phase.shape[0]
         speed = rate + 2 * np.pi * max_frequency * respond(on_phase, inputs)
@@ -140,7 +144,7 @@ def make_sensory_cpg(
         offset = offset + follow * (jnp.clip(aim, -1, 1) - offset)
         wave = offset[:rows] + swing * begun
         command = wave if rows == offset.shape[0] else jnp.concatenate([wave, offset[rows:]])
-        target = middle + reach * jnp.clip(command, -1, 1)
+        target = center + reach * jnp.clip(command, -1, 1)
         return (samples, (phase, swing), offset), target
 
     found = make_controller(made_for, blocks.genes, decode, init, step)

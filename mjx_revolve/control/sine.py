@@ -28,9 +28,9 @@ def make_sine(
 ) -> Controller:
     """One sine per hinge or thruster: amplitude, phase and offset, and a frequency shared by all.
 
-    target_i = offset_i + Σ_k a_ik sin(2π k f t + φ_ik), k = 1 … harmonics. One harmonic is the
-    plain sine; with more, the power stroke and the recovery stroke may differ in speed, as in
-    rowing. Amplitude and phase are evolved as a point in the plane, (u, v): a = amplitude × half
+    target_i = middle_i + offset_i + Σ_k a_ik sin(2π k f t + φ_ik), k = 1 … harmonics. One harmonic
+    is the plain sine; with more, the power stroke and the recovery stroke may differ in speed, as
+    in rowing. Amplitude and phase are evolved as a point in the plane, (u, v): a = amplitude × half
     range × sin|(u, v)| / k, φ its angle; so the map has no discontinuity at φ = ±π. Offset =
     amplitude × half of half range × sin(gene), f = f_max (1 + sin(gene)) / 2. The servo's range
     clips the sum. Amplitudes and offsets fade in over the first half second, so that no joint jumps

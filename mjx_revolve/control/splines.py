@@ -66,7 +66,7 @@ def make_splines(
         wave: Scalar = 0.0
         for k, row in enumerate(rows):
             wave = wave + _weight(at - k, points, jnp) * row
-        return state, middle + fade_in(time) * wave
+        return state, fade_in(time) * (middle + wave)
 
     return make_controller(made_for, blocks.genes, decode, lambda parameters: (), step)
 

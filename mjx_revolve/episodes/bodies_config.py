@@ -19,6 +19,7 @@ from mjx_revolve.inputs.schema import (
     Positive,
     Share,
     TupleOf,
+    words,
 )
 from mjx_revolve.inputs.user_code import short_name
 
@@ -146,7 +147,10 @@ class BodiesConfig(Settings):
 
     genotype: Annotated[str, one_of(GENOTYPES), File("code")] = "tree"
     """Representation of bodies: a genotype of `docs/evolution.md`, or FILE.py:FUNCTION."""
-    modules: Annotated[TupleOf[str], MinLen(1)] = ("FixedBrick", "ActiveHinge")
+    modules: Annotated[TupleOf[str], MinLen(1), words("a list of at least one type")] = (
+        "FixedBrick",
+        "ActiveHinge",
+    )
     """Types of modules that bodies are grown of, beside the core."""
     core: Annotated[str, MinLen(1)] = "Core"
     """Type of the core."""

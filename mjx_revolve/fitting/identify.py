@@ -29,6 +29,8 @@ SHARE = 1 / 3
 _KNOWN = SHARE**-2 - 1
 # Numbers that have this share of a direction are named. A choice.
 _NAMED = 0.3
+# Least rate of a planned motion's commands, whatever the frames' [1/s]. A choice.
+_SENT = 30.0
 
 
 class Unknown(NamedTuple):
@@ -45,12 +47,6 @@ class Unknown(NamedTuple):
     direction: np.ndarray
 
 
-def scaled(parameters: Sequence[Parameter], information: np.ndarray) -> np.ndarray:
-    """`[P, P]` information of the data over the priors'."""
-    spread = np.array([p.spread for p in parameters])
-    return spread[:, None] * information * spread
-
-
 def find_unknown(parameters: Sequence[Parameter], information: np.ndarray) -> list[Unknown]:
     """The directions that data do not determine, the least known first.
 
@@ -58,7 +54,8 @@ def find_unknown(parameters: Sequence[Parameter], information: np.ndarray) -> li
         parameters: P free numbers.
         information: `[P, P]` of the data alone.
     """
-    strength, directions = np.linalg.eigh(scaled(parameters, information))
+    spread = np.array([p.spread for p in parameters])
+    strength, directions = np.linalg.eigh(spread[:, None] * information * spread)
     found = []
     for k in np.flatnonzero(strength < _KNOWN):
         v = directions[:, k]
@@ -116,7 +113,10 @@ def list_motions(robot: Robot, settings: FitSettings) -> list[PlannedMotion]:
         settings: their length and the frames' rate.
     """
     length = float(body_geometry(robot).length)
-    time = np.arange(0.0, settings.duration + 1e-9, 1 / settings.rate)
+    time, sent = (
+        np.arange(0.0, settings.duration + 1e-9, 1 / rate)
+        for rate in (settings.rate, max(settings.rate, _SENT))
+    )
     modules = robot.morphology.modules
     hinges = [modules[k].name for k in robot.morphology.hinges]
     parts = [modules[k].kind.parts[i].thruster for k, i in robot.morphology.thrusters]
@@ -128,7 +128,7 @@ def list_motions(robot: Robot, settings: FitSettings) -> list[PlannedMotion]:
 
     def add(words: str, commands: dict[str, np.ndarray], velocity: Sequence[float] = (0,) * 6,
             turn: Sequence[float] = (0, 0, 0)) -> None:  # fmt: skip
-        signals = still | {f"command.{n}": TimeSeries(time, x) for n, x in commands.items()}
+        signals = still | {f"command.{n}": TimeSeries(sent, x) for n, x in commands.items()}
         recording = RobotRecording(f"motion {len(found) + 1}", signals)
         found.append(
             PlannedMotion(words, recording, np.array(velocity, float), np.array(turn, float))
@@ -140,17 +140,17 @@ def list_motions(robot: Robot, settings: FitSettings) -> list[PlannedMotion]:
     add("coast-down: spin it about z to 90°/s and let go", {}, np.eye(6)[5] * np.pi / 2)
     add("release: tilt it by 40° about x and let go", {}, turn=(0.7, 0, 0))
     add("release: tilt it by 40° about y and let go", {}, turn=(0, 0.7, 0))
-    on = (time < settings.duration / 2).astype(float)
+    on = (sent < settings.duration / 2).astype(float)
     if jets:
         for share in (0.5, 1.0):
             words = f"step: all thrusters at {100 * share:.0f} % of full ahead for half of the time"
             add(words, {n: share * jet.range[1] * on for n, jet in jets.items()})
         for n, jet in jets.items():
             add(f"step: {n} at 70 % for half of the time, alone", {n: 0.7 * jet.range[1] * on})
-        beat = np.sign(np.sin(2 * np.pi * time / 2.0))
+        beat = np.sign(np.sin(2 * np.pi * sent / 2.0))
         add("square wave: all thrusters, 1 s ahead and 1 s astern, at 70 %",
             {n: 0.7 * jet.range[1] * beat for n, jet in jets.items()})  # fmt: skip
-    sine = lambda hertz, late=0.0: np.sin(2 * np.pi * (hertz * time - late))  # noqa: E731
+    sine = lambda hertz, late=0.0: np.sin(2 * np.pi * (hertz * sent - late))  # noqa: E731
     for n in hinges:
         add(f"sine: {n}, 0.6 rad at 1 Hz, the others held", {n: 0.6 * sine(1.0)})
     if len(hinges) > 1:

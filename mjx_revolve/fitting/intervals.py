@@ -78,12 +78,6 @@ class Estimate:
     noise: dict[str, float]
     inflation: dict[str, float]
 
-    def interval(self, problem: FitProblem, k: int) -> tuple[float, float, float]:
-        """Value, lower and upper end of a free number."""
-        low, high = self.ends[k]
-        middle, low, high = (problem.parameters[k].value(x) for x in (self.offsets[k], low, high))
-        return middle, low, high
-
 
 def estimate(problem: FitProblem, state: FitState, model: Model) -> Estimate:
     """Values and their covariance at the end of a search."""

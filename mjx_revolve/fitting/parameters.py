@@ -190,6 +190,9 @@ def _plain_value(
 ) -> Parameter | None:
     """A number with a unit, or a thruster's, which may differ from module to module."""
     name = "thruster.time_constant" if name == "thruster_lag" else name
+    given = {m.name: m.params for m in body.modules}
+    # The types' numbers are after the modules' own factors, which apply to what is put here, too.
+    own = lambda module, key: given[module].get("factors", {}).get(key, 1.0)  # noqa: E731
     head, _, field = name.partition(".")
     if head == "thruster" and field in _THRUSTER:
         jets = {
@@ -198,19 +201,22 @@ def _plain_value(
             for part in kind.parts
             if part.thruster is not None
             and getattr(part.thruster, field) is not None
+            # A curve's values are no gain, and a thrust that is given sets the gain.
             and not (field == "gain" and part.thruster.curve == "interpolated")
+            and not (field == "gain" and "thrust" in given[module])
         }
         if not jets:
             raise InputError(f"--free {text}", f"a robot with a thruster's {field}", "none")
         if field == "time_constant":
-            own = {jet.time_constant for jet in jets.values()}
-            start = max(own) or _USUAL_LAG
+            start = max(jet.time_constant for jet in jets.values()) or _USUAL_LAG
             lag = lambda v: {m: {"thruster": {field: v}} for m in jets}  # noqa: E731
             return Parameter(text, "s", start, math.log(_THRUSTER[field]), True, lag)
 
         def scaled(value: float) -> dict[str, Any]:
+            thrust = "thrust" if field.startswith("gain") else ""
             return {
-                m: {"thruster": {field: value * getattr(jet, field)}} for m, jet in jets.items()
+                m: {"thruster": {field: value * getattr(jet, field) / own(m, thrust)}}
+                for m, jet in jets.items()
             }
 
         return Parameter(text, "", 1.0, math.log(_THRUSTER[field]), True, scaled)
@@ -225,10 +231,10 @@ def _plain_value(
         most = _BALLAST_SHARE * body.mass
         start = part.ballast_mass or most
         spread = math.log(2.0) if part.ballast_mass else 1.0
-        [params] = [m.params for m in body.modules if m.name == module]
         # What has none of a place is spread over the module, and so is what is found.
-        place = {} if params.get("ballast") and part.ballast_mass == 0 else {"ballast_position": at}
-        put = lambda v: {module: {"ballast": v} | place}  # noqa: E731
+        spread_out = given[module].get("ballast") and part.ballast_mass == 0
+        place = {} if spread_out else {"ballast_position": at}
+        put = lambda v: {module: {"ballast": v / own(module, "mass")} | place}  # noqa: E731
         return Parameter(text, "kg", start, spread, True, put)
     if field not in ("x", "y", "z"):
         return None

@@ -18,6 +18,9 @@ from mjx_revolve.water.bed import bed_height
 # Marks fit a robot if they are so far off at most, in lengths of the robot, and are swapped or
 # mirrored if that makes them fit so many times better. Choices.
 _MISFIT, _BETTER = 0.1, 3.0
+# Marks in space that are nearer than this to a line say less of the roll about it than that the
+# robot is level [m]: a camera's usual error.
+_LEVEL = 5e-3
 
 
 class MarkPoints:
@@ -114,6 +117,9 @@ def fit_rigid(
     x = model[..., :dims]
     middle = [np.einsum("nm,nmi->ni", weight, p) for p in (x, y)]
     across = np.einsum("nm,nmi,nmj->nij", weight, x - middle[0][:, None], y - middle[1][:, None])
+    if not planar:
+        # Of marks on a line, the turn nearest to level: they say nothing of the roll about it.
+        across[:, 2, 2] += _LEVEL**2
     u, _, v = np.linalg.svd(across)
     flip = np.ones((len(x), dims))
     flip[:, -1] = np.sign(np.linalg.det(u) * np.linalg.det(v))

@@ -81,7 +81,8 @@ class FitSettings:
         window: length of a window [s]; those in which the motion is far from linear across what
             is not known are cut.
         held_out: share of the recordings, or of each one's end where there are fewer than four,
-            that nothing is fitted to.
+            that nothing is fitted to; each one's end, too, where a recording has no attitude, as
+            nothing says which way it heads.
         iterations: at most.
         duration: of a planned motion [s].
         motions: how many are planned.
@@ -366,6 +367,8 @@ def make_problem(
     begin = np.array([v.begin for v in views])
     end = np.array([v.end for v in views])
     held = _held_out(len(recordings), settings.held_out)
+    if any(v.quat is None and np.isfinite(v.position).any() for v in views):
+        held[:] = False  # nothing says which way one that is held out heads
     share = 0.0 if held.any() else settings.held_out
     # A mean speed is one number, at the end.
     tracks = np.array(["mean_speed" not in r.signals for r in recordings])
@@ -399,6 +402,8 @@ def make_problem(
         _commands(r, b, dt, count, hinges, jets, prescribed, windows)
         for r, b in zip(recordings, begin, strict=True)
     )
+    if "clock" in local and all(np.array_equal(f(0.0), f(0.05)) for f in commands):
+        raise InputError("--free clock", "commands that may come late", "none that change")
     ctrl = np.stack([f(0.0) for f in commands], -1)
     ctrl = np.stack([ctrl, ctrl], -2)
     later = np.zeros(1 + 2 * len(parameters) + len(local) + START, bool)
@@ -613,11 +618,8 @@ class _View:
             self._fit_marks()
         if self.quat is not None and not np.isfinite(self.quat).all(1).any():
             self.quat = None
-        spans = {n: s.time for n, s in signals.items()
-                 if "mean_speed" in signals or not n.startswith(_SENT)}  # fmt: skip
-        kept = [
-            t for n, t in spans.items() if "mean_speed" in signals or n not in _between(signals)
-        ]
+        other = () if "mean_speed" in signals else (*_SENT, *_between(signals))
+        kept = [s.time for n, s in signals.items() if not n.startswith(other)]
         self.begin = min(float(t[0]) for t in kept)
         self.end = max(float(t[-1]) for t in kept)
 

@@ -169,6 +169,21 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
     return RobotRecording(path.stem, signals, marks, tuple(notes))
 
 
+def check_recording(recording: RobotRecording, robot: Robot) -> None:
+    """Refuses a recording, made in code, that is none of the robot.
+
+    Raises:
+        InputError: a signal has no known name, times that do not rise, or values that cannot be.
+    """
+    with reading(recording.name):
+        for name, signal in recording.signals.items():
+            if not _SIGNAL.fullmatch(name):
+                raise InputError(name, _KNOWN, "a name of no meaning")
+            if (np.diff(signal.time) <= 0).any():
+                raise InputError(f"{name}: time", "rising times", "others")
+        _check_signals(recording.signals, robot)
+
+
 def _mapped(
     signals: dict[str, TimeSeries], columns: Mapping[str, str], robot: Robot
 ) -> tuple[dict[str, TimeSeries], list[str]]:

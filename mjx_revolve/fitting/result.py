@@ -15,7 +15,8 @@ from mjx_revolve.fitting.identify import Unknown, find_unknown, is_found, plan_m
 from mjx_revolve.fitting.intervals import LEVEL, Estimate, estimate
 from mjx_revolve.fitting.parameters import entries_of, split_free, with_values
 from mjx_revolve.fitting.problem import LOCAL_UNITS, FitProblem, FitSettings, make_problem
-from mjx_revolve.fitting.recording import RobotRecording
+from mjx_revolve.fitting.recording import RobotRecording, check_recording
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.yaml_reader import dump_yaml
 
 
@@ -196,6 +197,10 @@ def fit_robot(
     Raises:
         InputError: a recording or a name does not suit the robot.
     """
+    if not recordings:
+        raise InputError("recordings", "at least one", "none")
+    for recording in recordings:
+        check_recording(recording, robot)
     problem = make_problem(robot, recordings, free, settings or FitSettings())
     state = begin(problem, seed)
     model = linearize(problem, state.point)
@@ -216,12 +221,16 @@ def conclude(
     found = estimate(problem, state, model)
     values = []
     for k, parameter in enumerate(problem.parameters):
-        value, low, high = found.interval(problem, k)
+        value, low, high = map(parameter.value, (found.offsets[k], *found.ends[k]))
         known = is_found(parameter, float(np.ptp(found.ends[k])))
         values.append(FittedValue(parameter.name, parameter.unit, value, low, high, known))
     unknown = tuple(find_unknown(problem.parameters, found.information))
+    # What is sought of a current is its difference from the world's.
+    current = problem.robot.world.current
+    there = {f"current_{axis}": value for axis, value in zip("xyz", current, strict=True)}
+    whole = found.local + np.array([there.get(name, 0.0) for name in problem.local])
     local = tuple(
-        (recording.name, name, float(found.local[r, k]), float(found.local_spread[r, k]))
+        (recording.name, name, float(whole[r, k]), float(found.local_spread[r, k]))
         for r, recording in enumerate(problem.recordings)
         for k, name in enumerate(problem.local)
         if np.isfinite(problem.fitted_until[r])

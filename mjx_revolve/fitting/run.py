@@ -137,8 +137,8 @@ def load_robot(
     copies: dict[str, bytes] = {}
     entry: dict[str, Any] = {"robot": "inputs/robot.yaml", "world": world}
     if Path(world).is_file():
-        copies |= read_world_files(world)
-        entry["world"] = f"inputs/{Path(world).name}"
+        copies |= {f"world/{name}": content for name, content in read_world_files(world).items()}
+        entry["world"] = f"inputs/world/{Path(world).name}"
     if modules is not None:
         copies["modules.yaml"] = read_file(modules)
         entry["modules"] = "inputs/modules.yaml"

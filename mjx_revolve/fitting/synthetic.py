@@ -24,14 +24,16 @@ def simulate_signals(
     velocity: Sequence[float] = (0.0,) * 6,
     duration: float = 5.0,
 ) -> dict[str, TimeSeries]:
-    """What a robot does from its rest pose, 1 m deep, by the program that fits use.
+    """What a robot does from rest, 1 m deep, by the program that fits use.
+
+    Its hinges begin at their first commands, as in fits.
 
     Args:
         robot: with its usual numbers.
         free: names of those that are others.
         offsets: of them from their priors' medians (logarithms of factors).
         ctrl: `[T, nu]` commands, MuJoCo's order, a row for each step; none for `duration`.
-        current: of the water, horizontal [m/s].
+        current: of the water beside the world's, horizontal [m/s].
         velocity: of the core at first: world frame [m/s], turning in its own [rad/s].
         duration: without commands [s].
 

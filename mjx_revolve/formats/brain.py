@@ -246,8 +246,7 @@ def _blank_readings(plant: Plant, signals: Sequence[str], seen: bool) -> SensorR
 
 def _present(plant: Plant, name: str) -> np.ndarray:
     """`SensorReadings.present` of a module signal."""
-    there = np.asarray(plant.site(name).there, float)
-    return np.broadcast_to(there, there.shape or (1,))
+    return np.atleast_1d(np.asarray(plant.site(name).there, float))
 
 
 def _list_readings(readings: SensorReadings) -> list[tuple[str, str, str, list[np.ndarray]]]:

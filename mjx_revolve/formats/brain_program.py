@@ -8,7 +8,7 @@ once, in the form of NumPy and of C99.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -324,7 +324,6 @@ class Builder:
     def _move(self, equation: Any, args: list[int], shapes: list[tuple[int, ...]]) -> list[int]:
         """An operation that only moves elements, applied to their indices."""
         name, params = equation.primitive.name, equation.params
-        outs = [atom.aval.shape for atom in equation.outvars]
         if name == "gather" and params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP:
             return self._gather_or_fill(equation, args, shapes)
         which = _MOVES[name]
@@ -337,10 +336,7 @@ class Builder:
                 first += size
                 continue
             grids.append(self._places(number, name).reshape(shape))
-        if name in _INDEXERS:
-            made: Any = _INDEXERS[name](grids, params, outs[0])
-        else:
-            made = equation.primitive.bind(*grids, **params)
+        made = equation.primitive.bind(*grids, **params)
         found = made if isinstance(made, list | tuple) else [made]
         sources = [args[k] for k in moved]
         return [self.take(sources, np.asarray(x)) for x in found]
@@ -395,34 +391,6 @@ class Builder:
             pair = self.take([args[0]], a), self.take([args[1]], b)
             terms.append(self.apply("mul", kind, *pair))
         return self._fold("add", kind, terms)
-
-
-def _broadcast(grids: list[np.ndarray], params: dict[str, Any], out: tuple[int, ...]) -> np.ndarray:
-    inner = [1] * len(out)
-    for axis, size in zip(params["broadcast_dimensions"], grids[0].shape, strict=True):
-        inner[axis] = size
-    return np.broadcast_to(grids[0].reshape(inner), out)
-
-
-def _sliced(grids: list[np.ndarray], params: dict[str, Any], out: tuple[int, ...]) -> np.ndarray:
-    ends = zip(
-        params["start_indices"],
-        params["limit_indices"],
-        params["strides"] or [1] * len(out),
-        strict=True,
-    )
-    return grids[0][tuple(slice(*end) for end in ends)]
-
-
-# The frequent ones by NumPy, as JAX would compile each.
-_INDEXERS: dict[str, Callable[[list[np.ndarray], dict[str, Any], tuple[int, ...]], np.ndarray]] = {
-    "reshape": lambda grids, params, out: grids[0].reshape(out),
-    "squeeze": lambda grids, params, out: grids[0].reshape(out),
-    "slice": _sliced,
-    "transpose": lambda grids, params, out: grids[0].transpose(params["permutation"]),
-    "broadcast_in_dim": _broadcast,
-    "concatenate": lambda grids, params, out: np.concatenate(grids, params["dimension"]),
-}
 
 
 def kind_of(dtype: Any) -> str:

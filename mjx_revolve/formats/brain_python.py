@@ -91,6 +91,7 @@ def make_brain_python(brain: Brain) -> str:
     program, code = brain.program, _PythonCode(brain.program)
     code.write()
     title, words, interface = describe_brain(brain)
+    after = [code.name_of(program.after[k]) for k in code.live_states]
     tables = ""
     for name, data in code.constants.items():
         dtype = _DTYPES[kind_of(data.dtype)]
@@ -108,7 +109,6 @@ def make_brain_python(brain: Brain) -> str:
         body.append(f"({', '.join(value.label for value in states)},) = self.state")
     body += code.lines
     if states:
-        after = [code.name_of(program.after[k]) for k in code.live_states]
         body.append(f"self.state = ({', '.join(after)},)")
     count = len(brain.commands)
     body.append(f"return np.array({code.name_of(program.commands)}, REAL).reshape({count})")

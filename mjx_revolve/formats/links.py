@@ -292,19 +292,18 @@ def _mesh_names(morphology: Morphology) -> list[str]:
     """For each part the name of its mesh: that of type and part, numbered where shapes differ."""
     parts = _parts(morphology)
     stems = [plain(f"{module.kind.name}_{part.name}").lower() for module, part in parts]
-    taken, names = {*stems}, []
-    seen: dict[str, list[tuple[object, str]]] = {}
-    for stem, (module, part) in zip(stems, parts, strict=True):
-        # All that a mesh depends on.
-        drawn = (module.kind.hinge, part.boxes, part.volume, part.position, part.thruster)
-        known = seen.setdefault(stem, [])
-        name = next((name for shape, name in known if shape == drawn), None)
-        if name is None:
-            name = free_name(stem, taken) if known else stem
-            taken.add(name)
-            known.append((drawn, name))
-        names.append(name)
-    return names
+    taken = {*stems}
+    # All that a mesh depends on.
+    drawn = [
+        (stem, module.kind.hinge, part.boxes, part.volume, part.position, part.thruster)
+        for stem, (module, part) in zip(stems, parts, strict=True)
+    ]
+    names: dict[object, str] = {}
+    for stem, shape in zip(stems, drawn, strict=True):
+        if shape not in names:
+            names[shape] = free_name(stem, taken) if stem in names.values() else stem
+            taken.add(names[shape])
+    return [names[shape] for shape in drawn]
 
 
 def unique_names(names: list[str], taken: set[str], added: Sequence[str] = ("",)) -> list[str]:

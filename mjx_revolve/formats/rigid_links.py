@@ -7,6 +7,7 @@ are fixed to another one are merged into it. Unsupported properties are named in
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -268,6 +269,8 @@ def _read_urdf(root: Element, path: Path) -> RigidRobot:
 def _inertial(element: Element, place: Place) -> np.ndarray:
     position, rotation = _then(place, _origin(element))
     mass = _numbers(element.find("mass"), "value", 1, None)[0]
+    if mass < 0:
+        raise InputError("<mass> value", "a number >= 0", f"{mass:g}")
     entries = element.find("inertia")
     names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
     x, y, z, xy, xz, yz = (_numbers(entries, name, 1, "0")[0] for name in names)
@@ -367,6 +370,8 @@ def _urdf_hinge(joint: Element, missing: list[str]) -> _Hinge | None:
     limits: dict[str, Any] = {}
     for ours, theirs in (("effort", "effort"), ("speed", "velocity")):
         value = _numbers(limit, theirs, 1, "0")[0]
+        if value < 0:
+            raise InputError(f"{name}: <limit> {theirs}", "a number >= 0", f"{value:g}")
         if value > 0:
             limits[ours] = value
     if kind == "revolute":
@@ -458,18 +463,24 @@ def _mjcf_hinge(model: mujoco.MjModel, body: int, missing: list[str]) -> tuple[_
     limits: dict[str, Any] = {}
     if model.jnt_limited[j]:
         limits["range"] = (model.jnt_range[j] - model.qpos0[model.jnt_qposadr[j]]).tolist()
-    efforts = [model.jnt_actfrcrange[j][1]] if model.jnt_actfrclimited[j] else []
-    for k in range(model.nu):
-        moves = model.actuator_trntype[k] in _MOVES_JOINTS and model.actuator_trnid[k, 0] == j
-        gear = abs(model.actuator_gear[k, 0])
-        if moves and model.actuator_forcelimited[k]:
-            efforts.append(model.actuator_forcerange[k][1] * gear)
+    efforts = []
+    for k in np.flatnonzero(np.isin(model.actuator_trntype, list(_MOVES_JOINTS))):
+        if model.actuator_trnid[k, 0] != j:
+            continue
+        gear, most = abs(model.actuator_gear[k, 0]), math.inf
+        if model.actuator_forcelimited[k]:
+            most = np.abs(model.actuator_forcerange[k]).max() * gear
         kind = model.actuator_gaintype[k], model.actuator_biastype[k]
-        if moves and model.actuator_ctrllimited[k] and kind == _MOTOR:
+        if model.actuator_ctrllimited[k] and kind == _MOTOR:
             gain = abs(model.actuator_gainprm[k, 0])
-            efforts.append(np.abs(model.actuator_ctrlrange[k]).max() * gain * gear)
-    if efforts and min(efforts) > 0:
-        limits["effort"] = min(efforts)
+            most = min(most, np.abs(model.actuator_ctrlrange[k]).max() * gain * gear)
+        efforts.append(most)
+    # Actuators of one joint add up.
+    effort = sum(efforts) if efforts else math.inf
+    if model.jnt_actfrclimited[j]:
+        effort = min(effort, np.abs(model.jnt_actfrcrange[j]).max())
+    if 0 < effort < math.inf:
+        limits["effort"] = float(effort)
     return (model.jnt_axis[j].copy(), model.jnt_pos[j].copy(), limits), model.joint(j).name
 
 

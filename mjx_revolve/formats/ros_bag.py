@@ -26,7 +26,7 @@ from mjx_revolve.inputs.files import write_atomic
 from mjx_revolve.inputs.packages import check_package
 from mjx_revolve.numerics.spatial import quat_mul, quat_to_matrix
 
-# Messages per second, unless the simulation steps more slowly [1/s].
+# About so many messages per second: one every so many whole steps [1/s].
 RATE = 100.0
 
 # Latched topics, with one message that late subscribers receive, too.

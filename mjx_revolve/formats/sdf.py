@@ -103,7 +103,7 @@ def make_sdf(robot: Robot, meshes: str = "meshes/", start: np.ndarray | None = N
         title=robot.morphology.name,
         model=name,
         water=to_list(_water(robot)),
-        missing=to_list(_missing(robot)),
+        missing=to_list(_missing(robot, links)),
     )
     return to_document(node("sdf", world, version="1.11"), note)
 
@@ -222,13 +222,17 @@ def _carried(robot: Robot, part: PlacedPart) -> Iterator[Element]:
 
 
 def _collision(robot: Robot, part: PlacedPart) -> Iterator[Element]:
-    """A box with the part's displaced volume, for Gazebo's buoyancy, and for contact."""
+    """A box with the part's displaced volume, for Gazebo's buoyancy, and for contact.
+
+    Where nothing is lifted, of its own size.
+    """
     table, row = robot.fluid, part.row
-    if table.buoyancy[row] == "off" or table.volume[row] <= 0:
+    size, lifted = 2 * table.half_size[row], _is_lifted(robot, part)
+    if lifted:
+        size = size * (table.volume[row] / size.prod()) ** (1 / 3)
+    elif not _is_solid(robot, part):
         return
-    size = 2 * table.half_size[row]
-    size = size * (table.volume[row] / size.prod()) ** (1 / 3)
-    pose = _pose(table.center_of_volume[row], np.eye(3))
+    pose = _pose(lifted * table.center_of_volume[row], np.eye(3))
     box = node("geometry", node("box", node("size", size)))
     ghost = node("surface", node("contact", node("collide_bitmask", 0)))
     yield node("collision", pose, box, *([] if part.part.contact else [ghost]), name="collision")
@@ -247,7 +251,11 @@ def _rotor(part: PlacedPart, name: str) -> Iterator[Element]:
 
 def _is_solid(robot: Robot, part: PlacedPart) -> bool:
     """Whether others collide with it."""
-    return part.part.contact and robot.fluid.volume[part.row] > 0
+    return part.part.contact and (_is_lifted(robot, part) or not _floats(robot))
+
+
+def _is_lifted(robot: Robot, part: PlacedPart) -> bool:
+    return robot.fluid.buoyancy[part.row] != "off" and robot.fluid.volume[part.row] > 0
 
 
 def _root(robot: Robot, link: Link) -> PlacedPart:
@@ -397,7 +405,7 @@ def _water(robot: Robot) -> list[tuple[object, str]]:
     ]
 
 
-def _missing(robot: Robot) -> list[tuple[object, str]]:
+def _missing(robot: Robot, links: tuple[Link, ...]) -> list[tuple[object, str]]:
     """Properties that Gazebo lacks: for each, whether robot or world has it, and a description."""
     bed = near_bed(robot)
     return [
@@ -406,6 +414,10 @@ def _missing(robot: Robot) -> list[tuple[object, str]]:
         (
             True,
             "contact at the modules' true corners: the collision boxes are those of the buoyancy",
+        ),
+        (
+            _floats(robot) and not all(_is_lifted(robot, p) for x in links for p in x.parts),
+            "contact of parts that the water does not lift",
         ),
         (
             robot.num_hinges,

@@ -159,6 +159,8 @@ def make_space(
         if name in names[:i]:
             raise InputError(f"bodies.modules.{i}", "each type once", f"{name!r} again")
     max_of = {find("max_of", name, False): most for name, most in bodies.max_of.items()}
+    if len(max_of) < len(bodies.max_of):
+        raise InputError("bodies.max_of", "each type once", ", ".join(bodies.max_of))
     for name in max_of:
         if name not in names:
             known = ", ".join(names)

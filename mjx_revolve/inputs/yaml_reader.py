@@ -1,6 +1,6 @@
 """Safe YAML: reads `1e-3` as a number; refuses duplicate keys, deep nesting and huge documents.
 
-What is written is read back as it was.
+What is written is read back as it was, but for the control character U+0085, as a blank.
 """
 
 from __future__ import annotations

@@ -305,7 +305,7 @@ def _draw_arena(axes: Axes, colony: ColonyConfig) -> None:
 
 
 def _draw_clinic(axes: Axes, colony: ColonyConfig) -> None:
-    """The circle in which founders are born."""
+    """The circle in which children are born."""
     radius = colony.birth.radius
     axes.add_patch(Circle((0, 0), radius, facecolor="#fbe3ec", edgecolor="#cc79a7", linewidth=1.0,
                           zorder=1))  # fmt: skip

@@ -41,11 +41,6 @@ Metrics = Mapping[str, np.ndarray]
 Curve = tuple[np.ndarray, np.ndarray]
 """Abscissae and best score so far of a run, `[T]` each."""
 
-_FITNESS = {
-    "generation", "evaluations", "best", "mean", "std", "median", "lower_quartile",
-    "upper_quartile", "champion", "step_size", "failed", "restarts", "seconds",
-    "evaluations_per_second",
-}  # fmt: skip
 # What is drawn of evolving bodies in place of the step size, the first that there is.
 _BODIES = {
     "coverage": "share of the\narchive's cells", "mean_num_modules": "modules, mean\nof the living"
@@ -131,12 +126,11 @@ def plot_fitness(metrics: Metrics, title: str = "", label: str = "fitness") -> F
     _draw_fitness(top, x, metrics, "best", "best so far")
     top.set_ylabel(label)
     whole_numbers(top)
-    measures = [name for name in metrics if name not in _FITNESS]
-    known = [name for name in LABELS if name in measures]
+    known = [name for name in LABELS if name in metrics]
     rate = ["evaluations_per_second"] if "evaluations_per_second" in metrics else []
-    if names := known + measures + rate:
+    if names := known + rate:
         left.plot(x, metrics[names[0]], color=ORANGE, linewidth=1.1, marker=dot)
-        of = "\nof the best" if measures else ""
+        of = "\nof the best" if known else ""
         left.set_ylabel(label_of(names[0]).replace(" (", "\n(") + of, fontsize=9)
     bodies = [name for name in _BODIES if name in metrics]
     if "step_size" in metrics:

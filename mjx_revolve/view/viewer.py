@@ -124,7 +124,7 @@ def write_colony_page(
     data = replay_data(robots, low - 0.5 * size, marks, leap) | {"many": True, "episode": None}
     page = {"maker": "colony", "title": title}
     bare = len(fill_page("replay", subtitle="", data=data, **page).encode())
-    poses, gap, packed = _fit(robots, window, max(most - bare, most // 50))
+    poses, gap, packed = _fit(robots, window, max(most - bare, most // 50, 1))
     count = f"{len(robots)} robot{'s' if len(robots) > 1 else ''}"
     often = f"a pose of each every {gap:.2g} s" if gap > 0.1 else ""
     subtitle = " \u00b7 ".join(filter(None, (count, world.name.replace("_", " "), often)))

@@ -7,6 +7,7 @@ import math
 import os
 import re
 import shlex
+import zlib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -208,7 +209,7 @@ def _draw_archive(
 
 def anchor(record: RunRecord, number: int) -> str:
     """Anchor of an individual's card on a page about several runs."""
-    return f"individual-{re.sub('[^A-Za-z0-9]+', '-', record.label)}-{number}"
+    return f"individual-{zlib.crc32(record.label.encode()):08x}-{number}"
 
 
 def choose_individuals(record: RunRecord, which: str | Sequence[int]) -> list[int]:

@@ -92,8 +92,7 @@ def list_rows(sweep: Sweep, outcomes: Sequence[Outcome]) -> list[dict[str, objec
     Case, settings in which cases differ as they were typed, seed, generations, evaluations,
     seconds, and all figures of the champion.
     """
-    varied = [axis.key for axis in read_axes(sweep.settings) if len(axis.texts) > 1]
-    rows = []
+    varied, rows = _varied(sweep), []
     for outcome in outcomes:
         plan, metrics = outcome.plan, outcome.metrics
         typed = dict(setting.split("=", 1) for setting in plan.settings)
@@ -130,11 +129,7 @@ def make_report(
     numbered = {cases.index(case): found for case, found in known.items()}
     tasks = dict.fromkeys(found[0].task for found in numbered.values())
     content: list[tuple[str, str, str]] = []
-    unequal = [
-        axis.key
-        for axis in read_axes(sweep.settings)
-        if len(axis.texts) > 1 and axis.key.startswith("task.") and axis.key != "task.type"
-    ]
+    unequal = [k for k in _varied(sweep) if k.startswith("task.") and k != "task.type"]
     for n, task in enumerate(tasks):
         members = {k: found for k, found in numbered.items() if found[0].task == task}
         of = f": {task.replace('_', ' ')}" if len(tasks) > 1 else ""
@@ -158,9 +153,14 @@ def make_report(
     return make_page(title, short_path(folder), lead, content)
 
 
+def _varied(sweep: Sweep) -> list[str]:
+    """Keys of the settings in which cases differ."""
+    return [axis.key for axis in read_axes(sweep.settings) if len(axis.texts) > 1]
+
+
 def case_words(sweep: Sweep, case: str) -> str:
     """The settings that set a case apart, in words; its folder's name is no text to read."""
-    varied = [axis.key for axis in read_axes(sweep.settings) if len(axis.texts) > 1]
+    varied = _varied(sweep)
     typed = (setting.split("=", 1) for setting in sweep.cases[case])
     words = [(key, text.strip("[]{}\"' ").replace(",", ", ")) for key, text in typed]
     return "; ".join(setting_words(*pair) for pair in words if pair[0] in varied) or case
