@@ -344,7 +344,7 @@ def test_the_gallery_has_every_robot_and_every_task():
         assert (ROOT / "docs" / "champions" / name / "champion" / "genes.yaml").is_file()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_reference_has_every_public_name_and_no_private_module(site):
     doors = ["mjx_revolve", *(f"mjx_revolve.{door}" for door in listed_doors())]
     for door in doors:

@@ -90,17 +90,14 @@ def test_on_the_simulators_clock_the_data_are_the_closed_form(readings):
     assert abs(water.drop_short - 0.25) > 10 * abs(water.drop - 0.25)
 
 
-@pytest.mark.parametrize(
-    ("main", "arguments", "message"),
-    [
-        (falling_spider.main, ["--data", "nowhere"], "--data: expected air_heights.txt and"),
-        (bench.main, ["--rounds", "two"], "expected a whole number >= 1; found 'two'"),
-        (gpu.main, ["--robot", "tiger"], "--robot: expected a shipped morphology; found 'tiger'"),
-        (shipped.main, ["--only", "moon"], "--only: expected any of auv_escape, "),
-        (validation.main, ["--quick", "--results"], "--results: expected all of the study; found"),
-        (senses.main, ["--only", "lake_target", "--results"], "--results: expected all"),
-    ],
-)
+@pytest.mark.parametrize(("main", "arguments", "message"), [
+    (falling_spider.main, ["--data", "nowhere"], "--data: expected air_heights.txt and"),
+    (bench.main, ["--rounds", "two"], "expected a whole number >= 1; found 'two'"),
+    (gpu.main, ["--robot", "tiger"], "--robot: expected a shipped morphology; found 'tiger'"),
+    (shipped.main, ["--only", "moon"], "--only: expected any of auv_escape, "),
+    (validation.main, ["--quick", "--results"], "--results: expected all of the study; found"),
+    (senses.main, ["--only", "lake_target", "--results"], "--results: expected all"),
+])  # fmt: skip
 def test_bad_options_end_with_one_line_and_code_2(main, arguments, message, capsys):
     assert run_command(main, arguments) == 2
     captured = capsys.readouterr()

@@ -32,17 +32,14 @@ def test_every_figure_is_traced_and_as_its_results_file_has_it(page):
     assert filled == page.read_text(encoding="utf-8"), "run: make numbers"
 
 
-@pytest.mark.parametrize(
-    ("template", "shown"),
-    [
-        ("{swim.score:.3f}", "0.154"),
-        ("{swim.seconds/60:.1f} min on {swim.date}", "6.2 min on 2026-11-23"),
-        ("{swim.interval}, {swim.interval.half:.2f}", "0.40 ± 0.10, 0.10"),
-        ("{swim.rows.snake.speed:,.0f}", "2,250,000"),
-        ("{swim.none:.2f}", "–"),
-        ("{swim.words}", "\n\n- one\n- two\n\n"),
-    ],
-)
+@pytest.mark.parametrize(("template", "shown"), [
+    ("{swim.score:.3f}", "0.154"),
+    ("{swim.seconds/60:.1f} min on {swim.date}", "6.2 min on 2026-11-23"),
+    ("{swim.interval}, {swim.interval.half:.2f}", "0.40 ± 0.10, 0.10"),
+    ("{swim.rows.snake.speed:,.0f}", "2,250,000"),
+    ("{swim.none:.2f}", "–"),
+    ("{swim.words}", "\n\n- one\n- two\n\n"),
+])  # fmt: skip
 def test_templates(template, shown):
     text = f"swims <!--n {template}-->12<!--/--> far"
     assert fill(text) == f"swims <!--n {template}-->{shown}<!--/--> far"
@@ -65,33 +62,27 @@ def test_a_field_that_no_results_file_has_is_named(field):
         fill(f"<!--n {{{field}}}-->1<!--/-->")
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "It swims at .55 body lengths/s.",
-        "It takes 81\nseconds.",
-        "an error of 12 %",
-        "**3×** faster",
-        "| a step | 354 |\n",
-        "```text\nchampion: 0.55\n```",
-        "<!-- 0.5 --> 2.5 m",
-        "x <!--n {swim.score:.1f} in 81 s-->0.2 in 81 s<!--/-->",
-    ],
-)
+@pytest.mark.parametrize("text", [
+    "It swims at .55 body lengths/s.",
+    "It takes 81\nseconds.",
+    "an error of 12 %",
+    "**3×** faster",
+    "| a step | 354 |\n",
+    "```text\nchampion: 0.55\n```",
+    "<!-- 0.5 --> 2.5 m",
+    "x <!--n {swim.score:.1f} in 81 s-->0.2 in 81 s<!--/-->",
+])  # fmt: skip
 def test_figures_outside_marked_places_are_found(text):
     assert len(list(figures.find_figures(f"Before.\n\n{text}", []))) >= 1
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "see <!--n {swim.score*100:.0f} % ± {swim.score}-->15 % ± 0.15<!--/-->",
-        "with `--set task.duration=0.5` and `over\ntwo lines 0.5 s`",
-        "JAX 0.10.2 and MuJoCo 4.0, version 1.2.3",
-        "[a link](https://example.org/0.5%20s), 2 cores, seed 0, 16 starts, 3 m deep",
-        "```\nsleep 10.5\n```\n\n```python\nx = 0.5\n```",
-    ],
-)
+@pytest.mark.parametrize("text", [
+    "see <!--n {swim.score*100:.0f} % ± {swim.score}-->15 % ± 0.15<!--/-->",
+    "with `--set task.duration=0.5` and `over\ntwo lines 0.5 s`",
+    "JAX 0.10.2 and MuJoCo 4.0, version 1.2.3",
+    "[a link](https://example.org/0.5%20s), 2 cores, seed 0, 16 starts, 3 m deep",
+    "```\nsleep 10.5\n```\n\n```python\nx = 0.5\n```",
+])  # fmt: skip
 def test_what_is_no_measured_figure_is_left_alone(text):
     assert list(figures.find_figures(f"Before, {text}.", [])) == []
 

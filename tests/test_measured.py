@@ -11,6 +11,7 @@ def ratios(rows):
     return {row.what: row.ratio for row in rows}
 
 
+@pytest.mark.slow
 def test_a_rod_meets_what_a_rod_meets():
     found, before = (ratios(measured_cases.steady_drag(*x).rows) for x in ((), ("faces",)))
     assert found["square rod, face on"] == pytest.approx(1.75 / 2.0, rel=1e-6)

@@ -47,19 +47,16 @@ def test_shipped_files_name_their_schema_and_fit_it(path, schemas):
     assert problems(schemas[found.stem], load_yaml(path)) == []
 
 
-@pytest.mark.parametrize(
-    ("kind", "data"),
-    [
-        ("config", {"world": "lake"}),
-        ("config", {"world": "lake", "task": {"type": "speed", "duratoin": 3}}),
-        ("world", {"density": "heavy"}),
-        ("world", {"waves": {"amplitude": "high"}}),
-        ("morphology", {"body": {"type": "Core", "children": {0: {"orientation": 0}}}}),
-        ("morphology", {"body": {"type": "Core", "params": {"mass": -1}}}),
-        ("modules", {"modules": {"A": {"mount": "up", "parts": [{"size": [1, 1, 1], "mass": 1}]}}}),
-        ("sweep", {"config": "x.yaml", "seeds": 0}),
-    ],
-)
+@pytest.mark.parametrize(("kind", "data"), [
+    ("config", {"world": "lake"}),
+    ("config", {"world": "lake", "task": {"type": "speed", "duratoin": 3}}),
+    ("world", {"density": "heavy"}),
+    ("world", {"waves": {"amplitude": "high"}}),
+    ("morphology", {"body": {"type": "Core", "children": {0: {"orientation": 0}}}}),
+    ("morphology", {"body": {"type": "Core", "params": {"mass": -1}}}),
+    ("modules", {"modules": {"A": {"mount": "up", "parts": [{"size": [1, 1, 1], "mass": 1}]}}}),
+    ("sweep", {"config": "x.yaml", "seeds": 0}),
+])  # fmt: skip
 def test_wrong_files_do_not_fit(kind, data, schemas):
     assert problems(schemas[kind], data)
 

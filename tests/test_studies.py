@@ -110,6 +110,7 @@ def test_a_study_runs_what_is_left_and_reports_it(tmp_path, started, monkeypatch
         assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_champions_are_judged_at_rest_and_over_the_horizon(tmp_path, started, monkeypatch):
     made, found = [], []
 

@@ -165,18 +165,15 @@ def test_ctrl_c_stops_after_the_generation_under_way(folder, capsys):
     assert (page.count("not finished</td>"), page.count("not begun</td>")) == (1, 2)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--set", "evolution={seed: 9}"], "--set evolution.seed: expected --seeds N instead"),
-        (["--set", "task.duration=5,-6"], "duration=-6: --set task.duration: expected a number >"),
-        (
-            ["--set", "evolution.population_size=8,16", "--set", "task.settle=1,11"],
-            "population_size=8+settle=11: --set task.settle: expected a time below task.duration",
-        ),
-        (["--workers", "2", "--cluster", "x"], "--cluster: expected no --workers beside it"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["--set", "evolution={seed: 9}"], "--set evolution.seed: expected --seeds N instead"),
+    (["--set", "task.duration=5,-6"], "duration=-6: --set task.duration: expected a number >"),
+    (
+        ["--set", "evolution.population_size=8,16", "--set", "task.settle=1,11"],
+        "population_size=8+settle=11: --set task.settle: expected a time below task.duration",
+    ),
+    (["--workers", "2", "--cluster", "x"], "--cluster: expected no --workers beside it"),
+])  # fmt: skip
 def test_what_is_wrong_is_said_in_one_line_before_anything_is_written(
     arguments, message, folder, capsys
 ):

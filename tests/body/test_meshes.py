@@ -80,18 +80,14 @@ def test_broken_meshes_are_refused(case):
     assert refusal(check_mesh, mesh, "x.stl") == message
 
 
-@pytest.mark.parametrize(
-    "mesh",
-    [
-        box(),
-        (TETRAHEDRON * 1e-3, TETRAHEDRON_FACES),
-        trimesh.creation.annulus(0.2, 0.5, 1.0),
-        box((1, 1, 1e-4)),
-        join(box((2, 2, 2)), box((2, 2, 2), center=(2, 0, 0))),
-        join(box((4, 4, 4)), inverted(box((2, 2, 2))), box((1, 1, 1))),
-    ],
-    ids=["box", "tetrahedron", "ring", "sheet", "touching", "body in a void"],
-)
+@pytest.mark.parametrize("mesh", [
+    box(),
+    (TETRAHEDRON * 1e-3, TETRAHEDRON_FACES),
+    trimesh.creation.annulus(0.2, 0.5, 1.0),
+    box((1, 1, 1e-4)),
+    join(box((2, 2, 2)), box((2, 2, 2), center=(2, 0, 0))),
+    join(box((4, 4, 4)), inverted(box((2, 2, 2))), box((1, 1, 1))),
+], ids=["box", "tetrahedron", "ring", "sheet", "touching", "body in a void"])  # fmt: skip
 def test_good_meshes_pass(mesh):
     check_mesh(mesh)
 

@@ -1,5 +1,7 @@
 """Brains that listen, and splines: what all of them promise, and each by hand."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -68,12 +70,26 @@ def test_zero_genes_keep_still_whatever_is_felt(kind, name):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_a_middle_that_is_not_where_hinges_begin_fades_in(kind):
+    plant = plant_of(dry_robot("spider"))
+    plant = replace(plant, low=plant.low / 4)
+    controller = make(kind, plant)
+    found = targets(controller, plant, np.zeros((controller.num_genes, 1)), 150, sense_of(8))
+    middle = np.asarray(plant.low + plant.high) / 2
+    assert not found[0].any() and np.abs(np.diff(found, axis=0)).max() < middle.max() / 50
+    assert found[-1] == pytest.approx(middle, abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_genes_have_names_of_their_own_and_places(kind):
     controller = make(kind, plant_of(dry_robot("spider")))
     assert len(set(controller.gene_names)) == controller.num_genes == len(set(controller.genes))
     unclear = make_joint_network(plant_of(dry_robot("spider")), (Sensor(type="depth", name="z"),))
     with pytest.raises(InputError, match=r"^controller.sensors: .*; found two genes z>h1$"):
         gene_indices(unclear, unclear)
+    alike = (Sensor(type="climb", name="joint angle"), Sensor(type="angle"))
+    with pytest.raises(InputError, match=r"two genes phase joint angle$"):
+        make_sensory_cpg(plant_of(dry_robot("spider")), alike)
 
 
 @pytest.mark.slow

@@ -31,7 +31,7 @@ from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.flow import water_of
 
 NAMES = ("spider", "fish", "snake")
-pytestmark = pytest.mark.usefixtures("float64")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("float64")]
 
 
 @lru_cache(maxsize=1)
@@ -278,7 +278,6 @@ def duel(dt: float):
     return make_run(space, robots, 1, round(0.5 / dt), 2), np.array([0.3, 0.6])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.1, 0.5])
 def test_boxes_meet_without_passing_and_keep_momentum(speed):
     """Off centre, so that friction and torque act: momentum kept to rounding, energy only lost."""
@@ -305,7 +304,6 @@ def test_boxes_meet_without_passing_and_keep_momentum(speed):
     assert np.dot(gap[-1], (v[-1, :3, 1] - v[-1, :3, 0])) > 0
 
 
-@pytest.mark.slow
 def test_jointed_robots_meet_fast_and_lose_energy():
     """Spiders, fish and snakes at 2 m/s: none through another, no energy made. Forces are equal
     and opposite; what is left of momentum is the step's own, of hinges that whip."""

@@ -159,6 +159,7 @@ def test_a_spider_lands_and_stays(bed):
     assert speed.max() < (0.08 if bed is LAKE else 0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("timestep", [0.005, 0.02])
 def test_light_bodies_come_to_rest_wholly(timestep):
     """A brick of 15 g and a plate of 12 g, tumbling: after 8 s nothing moves. As points lost the

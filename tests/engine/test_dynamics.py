@@ -93,6 +93,7 @@ def test_acceleration_is_mujocos(drag):
     check_acceleration(robot, drag)
 
 
+@pytest.mark.slow
 def test_acceleration_in_float32():
     """Within 1e-5, what the population works with."""
     robot = stock(elbow_robot(world(gravity=9.81)))

@@ -140,7 +140,7 @@ def test_accelerations_are_those_of_each_body_alone(name):
             assert np.all(here[len(v) :] == 0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_more_padding_and_more_overflow_rows_change_nothing():
     """More rows, a deeper stack, a larger root, and bodies cut into more or fewer rows."""
     robots = zoo("waves and bed")

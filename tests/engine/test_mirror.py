@@ -86,6 +86,7 @@ def swim(robot, qpos, qvel, ctrl):
         return np.moveaxis(np.asarray(way), -1, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "name, axes, world",

@@ -29,6 +29,7 @@ from mjx_revolve.water.flow import water_of
 
 INWARDS = np.array([[0.785], [-0.785]])
 SWUNG = 498, 1717
+pytestmark = pytest.mark.slow
 
 
 def water(**fields):
@@ -82,7 +83,6 @@ def momentum(robot, qpos, qvel):
     return np.concatenate([linear, data.subtree_angmom[1]]), data.energy[1]
 
 
-@pytest.mark.slow
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("timestep", [0.005, 0.01, 0.02])
 def test_servos_at_full_torque_press_less_than_2_mm(timestep):
@@ -96,7 +96,6 @@ def test_servos_at_full_torque_press_less_than_2_mm(timestep):
     assert np.ptp(qpos[-20:, 7:], 0).max() < 1e-3
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("timestep", [0.005, 0.02])
 def test_a_plate_that_is_pressed_flat_on_a_face_lies_still(timestep):
     """The end of an arm that is folded onto the core: two hinges turn it, a face carries it."""
@@ -154,7 +153,6 @@ def test_a_hinge_that_is_pressed_against_its_end_lies_still(timestep):
     assert qpos[-1, 7:] == pytest.approx(np.clip(targets.T, low, high).T, abs=0.02)
 
 
-@pytest.mark.slow
 def test_contact_keeps_momentum_and_takes_energy():
     """Of the same state, a step with and one without contact."""
     robot, free = jaw(**EMPTY), jaw(**EMPTY, self_contact=False)
@@ -204,7 +202,6 @@ def two_jaws(robot):
     return qpos
 
 
-@pytest.mark.slow
 def test_touch_sensors_feel_the_robots_own_modules():
     robot = jaw(**EMPTY)
     ctrl = np.tile(INWARDS, 2)
@@ -238,7 +235,6 @@ def test_touch_sensors_feel_the_robots_own_modules():
         np.testing.assert_array_equal(pressed[..., lane], expected)
 
 
-@pytest.mark.slow
 def test_different_bodies_feel_themselves_and_others_as_one_alone_does():
     robot = jaw(**EMPTY)
     robots = [robot, build_robot(body("spider"), robot.world), robot]
@@ -290,7 +286,6 @@ def other_back_end(monkeypatch):
     return change
 
 
-@pytest.mark.slow
 def test_robots_that_are_looked_at_all_at_once_feel_the_same(other_back_end):
     robot = build_robot(fork(3, 1), water(timestep=0.01))
     qpos, qvel = open_jaw(robot, 3)
@@ -395,7 +390,6 @@ def test_a_level_of_hinges_that_bring_nothing_together_is_no_exception():
     assert jax.eval_shape(step, start, ctrl).clearance.shape == (2,)
 
 
-@pytest.mark.slow
 def test_pairs_that_can_never_meet_cost_nothing():
     """A spider's and a fish's step is, operation by operation, the one without self-contact."""
     assert len(candidate_pairs(build_robot(body("spider"), water()).assembly)) > 100
@@ -415,7 +409,6 @@ def test_pairs_that_can_never_meet_cost_nothing():
     assert len(ends) <= 6
 
 
-@pytest.mark.slow
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("timestep", [0.005, 0.02])
 def test_random_bodies_under_fast_random_gaits_hardly_overlap(timestep):

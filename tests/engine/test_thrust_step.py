@@ -137,6 +137,7 @@ def test_the_auv_surges_without_pitch_and_heaves_without_drift():
     assert np.abs(q[:, 6]).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_lagged_thrusters_compile_in_any_water():
     """XLA ended the process where a piece of the step left its commands unused."""
     tank = load_world("empty_underwater", waves=[{"amplitude": 0.03, "wavelength": 1.0}],

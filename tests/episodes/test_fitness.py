@@ -124,29 +124,26 @@ SETTINGS = SimpleNamespace(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("task", "given", "score"),
-    [
-        ("directed_swim", track([0, 1, 2]), 2.0),  # 1 m/s, half a metre long
-        ("directed_swim", track([0, -1, -2]), -2.0),
-        ("directed_swim", track([0, 1, 2], z=[-1, -1, -1]), 0.0),  # not at its depth
-        ("directed_swim", track([0, 1, 2], z=[0, 0, 2]), 1.0),  # for the first metre only
-        ("directed_swim", track([0, -1, -2], z=[-1, -1, -1]), -2.0),  # lost at any depth
-        ("crawl", track([0, -1, -2], clearance=0.5), -2.0),
-        ("speed", track([0, -1, -2]), 2.0),
-        ("speed", track([0, 1, 2], drift=1.0), 0.0),  # it drifted
-        ("speed", track([0, 0, 0], drift=0.5), 1.0),  # it held its own
-        ("speed", track([0, 1, 0], z=[0, 0, 2]), 0.0),  # a loop whose way back is off its depth
-        ("reach_target", track([0, 1, 3]), 6.0),  # from 4 m away to 1 m
-        ("hold_depth", track([0, 1], z=[0.5, 0.5]), -1.0),
-        ("hold_heading", turned([0, 0]), -1.0),  # off its depth alone
-        ("hold_heading", turned([0.3, -0.3, 0.3]), -1.3),
-        ("follow_bed", track([0, 1, 2], clearance=0.45), 2.0),
-        ("follow_bed", track([0, 1, 2], clearance=0.05), 0.0),  # too low
-        ("crawl", track([0, 1, 2], clearance=0.05), 2.0),
-        ("crawl", track([0, 1, 2], clearance=0.5), 0.0),  # it swam
-    ],
-)
+@pytest.mark.parametrize(("task", "given", "score"), [
+    ("directed_swim", track([0, 1, 2]), 2.0),  # 1 m/s, half a metre long
+    ("directed_swim", track([0, -1, -2]), -2.0),
+    ("directed_swim", track([0, 1, 2], z=[-1, -1, -1]), 0.0),  # not at its depth
+    ("directed_swim", track([0, 1, 2], z=[0, 0, 2]), 1.0),  # for the first metre only
+    ("directed_swim", track([0, -1, -2], z=[-1, -1, -1]), -2.0),  # lost at any depth
+    ("crawl", track([0, -1, -2], clearance=0.5), -2.0),
+    ("speed", track([0, -1, -2]), 2.0),
+    ("speed", track([0, 1, 2], drift=1.0), 0.0),  # it drifted
+    ("speed", track([0, 0, 0], drift=0.5), 1.0),  # it held its own
+    ("speed", track([0, 1, 0], z=[0, 0, 2]), 0.0),  # a loop whose way back is off its depth
+    ("reach_target", track([0, 1, 3]), 6.0),  # from 4 m away to 1 m
+    ("hold_depth", track([0, 1], z=[0.5, 0.5]), -1.0),
+    ("hold_heading", turned([0, 0]), -1.0),  # off its depth alone
+    ("hold_heading", turned([0.3, -0.3, 0.3]), -1.3),
+    ("follow_bed", track([0, 1, 2], clearance=0.45), 2.0),
+    ("follow_bed", track([0, 1, 2], clearance=0.05), 0.0),  # too low
+    ("crawl", track([0, 1, 2], clearance=0.05), 2.0),
+    ("crawl", track([0, 1, 2], clearance=0.5), 0.0),  # it swam
+])  # fmt: skip
 def test_tasks_with_known_scores(task, given, score):
     assert float(TASKS[task].score(given, SETTINGS)[0]) == pytest.approx(score, abs=1e-5)
 

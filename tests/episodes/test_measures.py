@@ -137,16 +137,12 @@ def test_the_stronger_of_two_frequencies_is_the_gaits():
     assert found["gait_phase_lag_rad"] == pytest.approx(0.7, abs=0.02)
 
 
-@pytest.mark.parametrize(
-    "angle",
-    [
-        np.full((90, 3), 0.4),  # held
-        np.linspace(0, 1, 90)[:, None],  # turned once
-        swing(1.0)[:3],  # too short a record
-        np.zeros((90, 0)),  # no joints
-    ],
-    ids=["held", "turned", "short", "none"],
-)
+@pytest.mark.parametrize("angle", [
+    np.full((90, 3), 0.4),  # held
+    np.linspace(0, 1, 90)[:, None],  # turned once
+    swing(1.0)[:3],  # too short a record
+    np.zeros((90, 0)),  # no joints
+], ids=["held", "turned", "short", "none"])  # fmt: skip
 def test_what_is_no_gait_has_no_frequency(angle):
     found = read(still(angle=angle), *GAIT)
     assert [found[name] for name in GAIT[:3]] == [0.0, 0.0, 0.0]

@@ -26,18 +26,15 @@ def judge(name, given, **settings):
     return float(TASKS[name].score(given, task)[0])
 
 
-@pytest.mark.parametrize(
-    ("x", "score"),
-    [
-        # The target is at 4.5 m, and touches within 0.5 m: 4 m of way.
-        ((0, 0, 0, 0), 0.0),
-        ((0, 2, 2, 2), 3 / 8),  # none, then half of it three times
-        ((0, 2, 0, 0), 3 / 8),  # once it was half way
-        ((0, -2, -4, -2), 0.0),
-        ((0, 4, 0, 0), 3 / 4),  # touched, and away again
-        ((0, 4.3, 4.6, 9), 3 / 4),
-    ],
-)
+@pytest.mark.parametrize(("x", "score"), [
+    # The target is at 4.5 m, and touches within 0.5 m: 4 m of way.
+    ((0, 0, 0, 0), 0.0),
+    ((0, 2, 2, 2), 3 / 8),  # none, then half of it three times
+    ((0, 2, 0, 0), 3 / 8),  # once it was half way
+    ((0, -2, -4, -2), 0.0),
+    ((0, 4, 0, 0), 3 / 4),  # touched, and away again
+    ((0, 4.3, 4.6, 9), 3 / 4),
+])  # fmt: skip
 def test_search_counts_the_nearest_and_how_soon(x, score):
     given = track(along_x(*x), target=along_x(*[4.5] * 4))
     assert judge("search", given) == pytest.approx(score, abs=1e-6)

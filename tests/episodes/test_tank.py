@@ -78,6 +78,7 @@ def test_alone_it_swims_as_in_an_episode(tank, mixed, robots):
     assert np.abs(np.ptp(trail.qpos[:, 7:count, 0], axis=0)).max() > 0.1  # it does move
 
 
+@pytest.mark.slow
 def test_time_begins_with_each_robot_and_places_are_alike(tank, mixed, robots):
     """The same robot, put in later, elsewhere in the tank's list and beside others far away: the
     same bits, as nothing of it depends on them but what it feels."""

@@ -109,6 +109,7 @@ def test_spaces_and_what_comes_out_are_as_gymnasium_has_them(env, episode):
         env.step(np.zeros(5))
 
 
+@pytest.mark.slow
 def test_a_target_that_drifts_stands_in_the_score_so_far(config):
     """A robot at rest loses what the target gains on it, step by step, and nothing beforehand."""
     more = {"task.type": "reach_target", "task.target_distance": 1.0, "task.target_speed": 0.1}

@@ -80,6 +80,7 @@ def test_learning_does_not_depend_on_the_other_bodies(folder):
         assert not np.isnan(alone[0].score)
 
 
+@pytest.mark.slow
 def test_learning_improves_and_is_what_counts(folder):
     config, executor = start(folder)
     born, key = founders(config, executor), jax.random.key(0)

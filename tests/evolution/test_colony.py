@@ -291,6 +291,7 @@ def test_what_cannot_be_a_colony_is_refused():
         make_rules(make_body_fitness(shallow))
 
 
+@pytest.mark.slow
 def test_the_shipped_configuration():
     """What docs/colony.md says of it."""
     config = load_config(ROOT / "configs" / "lake_colony.yaml")

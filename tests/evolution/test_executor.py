@@ -36,6 +36,7 @@ from toys import check_scores, contents, wait_for
 
 KEY = jax.random.key(1)
 needs_proc = pytest.mark.skipif(not Path("/proc").is_dir(), reason="lists processes by /proc")
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -130,7 +131,6 @@ def troubled(tmp_path_factory):
             yield executor, folder / "order"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 5, 33])
 def test_scores_do_not_depend_on_the_workers(troubled, size):
     check_scores(troubled[0], size, size)
@@ -235,7 +235,6 @@ def pids_of(executor):
     return [worker.process.pid for worker in executor.workers]
 
 
-@pytest.mark.slow
 @pytest.mark.sampled(1)
 @needs_proc
 @pytest.mark.parametrize(("kind", "how"), [
@@ -260,7 +259,6 @@ def test_a_lost_worker_is_replaced_and_costs_nothing(troubled, kind, how, caplog
         assert len(said) == 1 and re.fullmatch(rf"a worker is replaced \({how}\)", said[0]), said
 
 
-@pytest.mark.slow
 def test_a_block_that_kills_scores_worst_and_is_named(troubled, caplog):
     executor, _ = troubled
     population = np.random.default_rng(4).normal(size=(10, 5)).astype(np.float32)
@@ -276,7 +274,6 @@ def test_a_block_that_kills_scores_worst_and_is_named(troubled, caplog):
     assert said[-1] == f"4 individuals count as failed, {reason}"
 
 
-@pytest.mark.slow
 def test_a_run_goes_on_when_workers_are_killed(folder, capsys, monkeypatch):
     monkeypatch.setenv("TOY_TROUBLE", str(folder / "order"))
     more = ("--set", "evolution.generations=40")
@@ -305,7 +302,6 @@ def test_a_run_goes_on_when_workers_are_killed(folder, capsys, monkeypatch):
     assert host == runs.RunFolder(folder / "whole").load_checkpoint().meta["host"]
 
 
-@pytest.mark.slow
 def test_workers_that_cannot_be_built(folder, capsys, monkeypatch):
     monkeypatch.setenv("TOY_LEADER", str(os.getpid()))
     argv = ("toy.yaml", "--out", "run", "--workers", 2)
@@ -323,7 +319,6 @@ def test_workers_that_cannot_be_built(folder, capsys, monkeypatch):
     assert contents(folder / "run") == contents(folder / "whole")
 
 
-@pytest.mark.slow
 def test_workers_of_another_program_score_nothing(tmp_path, caplog):
     with make_executor(toy_config(tmp_path), 2, toys.make_toy) as executor:
         executor.identity |= {"mjx_revolve": "abc"}
@@ -368,7 +363,6 @@ def start_long(folder):
     return process, workers
 
 
-@pytest.mark.slow
 @needs_proc
 def test_ctrl_c_finishes_the_generation(folder):
     process, workers = start_long(folder)
@@ -385,7 +379,6 @@ def test_ctrl_c_finishes_the_generation(folder):
     assert contents(folder / "run") == contents(folder / "whole")
 
 
-@pytest.mark.slow
 @needs_proc
 def test_workers_do_not_outlive_their_leader(folder):
     process, workers = start_long(folder)
@@ -395,7 +388,6 @@ def test_workers_do_not_outlive_their_leader(folder):
     wait_for(lambda: not any(map(is_alive, workers)))
 
 
-@pytest.mark.slow
 def test_a_robot_does_not_depend_on_its_workers(tmp_path):
     path = toys.write_config(tmp_path / "knee.yaml", population_size=10)
     (tmp_path / "robot.yaml").write_text(OAR)

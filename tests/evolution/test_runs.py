@@ -266,16 +266,12 @@ def flip(data, at):
     return data[:at] + bytes([data[at] ^ 0xFF]) + data[at + 1 :]
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda data: b"",
-        lambda data: data[: len(data) // 2],
-        lambda data: flip(data, data.index(ARRAYS["state['algorithm'].mean"].tobytes()) + 5),
-        lambda data: flip(data, 200),
-    ],
-    ids=["empty", "half", "bit in an array", "bit in the meta"],
-)
+@pytest.mark.parametrize("damage", [
+    lambda data: b"",
+    lambda data: data[: len(data) // 2],
+    lambda data: flip(data, data.index(ARRAYS["state['algorithm'].mean"].tobytes()) + 5),
+    lambda data: flip(data, 200),
+], ids=["empty", "half", "bit in an array", "bit in the meta"])  # fmt: skip
 def test_a_damaged_checkpoint_is_passed_over(run, damage):
     save(run, 1)
     newest = save(run, 2)

@@ -35,6 +35,7 @@ from mjx_revolve.fitting import (
 from mjx_revolve.fitting.estimate import correlation, costs_of, linearize, middles, normal_equations
 from mjx_revolve.fitting.identify import find_unknown, plan_motions
 from mjx_revolve.fitting.parameters import entries_of, read_free, with_values
+from mjx_revolve.fitting.poses import fit_rigid
 from mjx_revolve.fitting.problem import NOISE, make_problem
 from mjx_revolve.fitting.recording import MarkedPoint, read_map
 from mjx_revolve.fitting.run import FitRun, Request, load_robot
@@ -45,6 +46,7 @@ from mjx_revolve.water.world import load_world
 
 FREE = ["drag", "added_mass", "thrust", "current"]
 TRUE = np.log([1.3, 0.8, 0.9])
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -259,7 +261,6 @@ def felt(signals, rate=50.0):
     return found | {"depth": TimeSeries(at, depth + 0.005 * draw.normal(size=len(at)))}
 
 
-@pytest.mark.slow
 def test_an_imu_and_a_depth_gauge_stand_for_attitude_and_height(auv, signals):
     """And commands whose clock is late; the coefficients and the delay are found all the same."""
     late = {
@@ -290,7 +291,6 @@ def test_a_wild_frame_does_no_harm(auv, signals, fitted):
         assert a.value == pytest.approx(b.value, rel=0.02)
 
 
-@pytest.mark.slow
 def test_a_search_that_begins_far_away_arrives(auv):
     """Where a robot tumbles, windows of 4 s alone led the search to numbers half as wrong again."""
     true = np.log([0.36, 2.1, 1.9])
@@ -442,21 +442,59 @@ def marks(order="abc", mirror=1.0, scale=1.0):
     return found
 
 
-@pytest.mark.parametrize(
-    ("columns", "words"),
-    [
-        (marks("bac"), "marks a and b: expected them as on the robot; found them swapped"),
-        (marks(mirror=-1.0), "found them mirrored"),
-        (marks(scale=2.0), "another scale"),
-    ],
-    ids=["swapped", "mirrored", "scale"],
-)
+@pytest.mark.parametrize(("columns", "words"), [
+    (marks("bac"), "marks a and b: expected them as on the robot; found them swapped"),
+    (marks(mirror=-1.0), "found them mirrored"),
+    (marks(scale=2.0), "another scale"),
+], ids=["swapped", "mirrored", "scale"])  # fmt: skip
 def test_marks_that_are_not_on_the_robot_are_refused(auv, tmp_path, columns, words):
     write_csv(tmp_path / "swim.csv", columns)
     where = [f"mark.{k}=core:{','.join(map(str, v))}" for k, v in MARKS.items()]
     recording = load_recording(tmp_path / "swim.csv", auv, read_map(where))
     with pytest.raises(InputError, match=words):
         make_problem(auv, [recording], ["drag"], FitSettings())
+
+
+def test_marks_on_a_line_in_space_keep_the_robot_level():
+    line = np.array([[[0.1, 0, 0], [0, 0, 0], [-0.1, 0, 0]]])
+    turn = Rotation.from_euler("ZYX", [[2.0, 0.05, 0.08]])
+    quat = fit_rigid(line, turn.apply(line[0])[None], planar=False)[1]
+    yaw, pitch, roll = Rotation.from_quat(quat, scalar_first=True).as_euler("ZYX")[0]
+    assert (yaw, pitch) == pytest.approx((2.0, 0.05), abs=2e-3) and abs(roll) < 2e-3
+
+
+def test_what_has_no_heading_is_held_out_at_its_end(auv):
+    time = np.arange(0, 8, 0.05)
+    spot = {f"mark.a.{x}": TimeSeries(time, v * time) for x, v in (("x", 0.1), ("y", 0), ("z", 0))}
+    given = [RobotRecording(n, spot, {"a": MarkedPoint(0, (0.0, 0.0, 0.0))}) for n in "abcd"]
+    problem = make_problem(auv, given, ["drag"], FitSettings())
+    assert np.isfinite(problem.fitted_until).all() and (problem.fitted_until < problem.end).all()
+
+
+def test_factors_of_modules_count_once():
+    """What nothing is changed of is the robot as it is, and a thrust that is given stays."""
+    own = {"thrust": 2.0, "mass": 1.2}
+    bow, stern = [{"factors": own}, {"thrust": 3.0, "factors": own}]
+    low = {"ballast": 0.03, "ballast_position": [0.0, 0.0, -0.01], "factors": own}
+    body = {"type": "Core", "id": "core", "params": low, "children": {
+        0: {"type": "Thruster", "id": "bow", "params": bow},
+        1: {"type": "Thruster", "id": "stern", "params": stern}}}  # fmt: skip
+    robot = build_robot(make_morphology({"body": body}), load_world("lake", bed="off"))
+    names = ["thruster.gain", "thruster.time_constant", "ballast@core"]
+    same = with_values(robot, free := read_free(names, robot), np.zeros(3))
+    more = with_values(robot, free, np.array([0.5, 0.0, 0.0]))
+    kinds = ([m.kind for m in x.morphology.modules[1:]] for x in (robot, same, more))
+    gains = np.array([[kind.parts[-1].thruster.gain for kind in own] for own in kinds])
+    assert gains == pytest.approx(gains[:1] * [[1, 1], [1, 1], [np.exp(0.5), 1]])
+    assert same.morphology.mass == pytest.approx(robot.morphology.mass)
+
+
+def test_recordings_made_in_code_are_checked(auv, signals):
+    for name, time, words in (("command.prot", [0.0, 1.0], "^mine: command.prot: expected"),
+                              ("x", [1.0, 0.0], "^mine: x: time: expected rising")):  # fmt: skip
+        wrong = RobotRecording("mine", signals | {name: TimeSeries(np.array(time), np.zeros(2))})
+        with pytest.raises(InputError, match=words):
+            fit_robot(auv, [wrong], ["drag"])
 
 
 def test_marks_may_be_seen_one_at_a_time(auv, tmp_path):

@@ -28,6 +28,7 @@ SETTINGS = [
 ]  # fmt: skip
 MARKS = {"bow": np.array([0.0, 0.1, 0.0]), "stern": np.array([0.0, -0.1, 0.0]),
          "top": np.array([0.03, 0.0, 0.05])}  # fmt: skip
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -252,7 +253,6 @@ def test_a_bag_of_either_kind_as_a_folder_and_as_a_file(fit, auv, signals, tmp_p
             np.testing.assert_array_equal(one, other[name])
 
 
-@pytest.mark.slow
 def test_a_bag_with_marks_an_imu_and_depth(fit, auv, signals, tmp_path):
     recording = make_noisy(signals, position=1e-4, attitude=1e-4, seed=1)
     time = recording.signals["x"].time

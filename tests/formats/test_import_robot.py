@@ -189,6 +189,10 @@ def test_an_mjcf_of_capsules_and_two_hinges(tmp_path):
     geared = MJCF.replace("forcerange", "ctrlrange").replace("forcelimited", "ctrllimited")
     other = import_robot(write(tmp_path, geared, "geared.xml")).modules["knee"].hinge
     assert other.effort == 1.5
+    motor = '<motor joint="knee" gear="3" forcerange="-.5 .5" forcelimited="true"/>'
+    two = MJCF.replace(motor, motor + motor.replace('"-.5 .5"', '"-1 .2"'))
+    both = import_robot(write(tmp_path, two, "two.xml")).modules["knee"].hinge
+    assert both.effort == pytest.approx(4.5)  # they add up, each by its stronger side
     assert found.missing == (
         "hip_y: a joint that is rigid here, as a link has one hinge",
         "1 × geoms of the world",

@@ -109,6 +109,18 @@ def test_sdf_weighs_what_the_robot_does(robot):
     np.testing.assert_allclose(inertia, full, atol=1e-10)
 
 
+def test_what_floats_not_has_boxes_of_its_own_size():
+    sunk = build_robot(load_morphology("spider"), load_world("lake", buoyancy="off"))
+    model, solid = (
+        model_of(sunk)[1],
+        [p for x in make_links(sunk) for p in x.parts if p.part.contact],
+    )
+    for part in solid:
+        size = model.findtext(f"link[@name='{part.name}']/collision/geometry/box/size").split()
+        np.testing.assert_allclose(np.array(size, float), 2 * sunk.fluid.half_size[part.row])
+    assert len(model.findall("link/collision")) == len(solid) > 20
+
+
 def test_sdf_has_the_water_of_each_part(robot):
     root, model = model_of(robot)
     table, density = robot.fluid, robot.world.density

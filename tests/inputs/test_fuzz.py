@@ -82,6 +82,7 @@ ROBOTS = (ARM, ELBOW, ROBOT)
 FREE = re.compile(r"^brain\b|\bparams\.foo$")
 
 
+@pytest.mark.slow
 @fuzz(80)
 @given(mutants(*ROBOTS) | wrecks(*(text.encode() for text in ROBOTS)))
 @example(Mutant(b"{body: {type: Core}, brain: &a !!omap [b: *a]}"))
@@ -220,6 +221,7 @@ def make_toy(config):
     return toys.make_toy_bodies(config) if config.bodies else toys.Quadratic()
 
 
+@pytest.mark.slow
 @fuzz(50)
 @given(mutants(*CONFIGS) | wrecks(*(text.encode() for text in CONFIGS)))
 @example(Mutant(b"[" * 5000 + b"}"))

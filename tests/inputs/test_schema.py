@@ -96,24 +96,21 @@ def test_they_are_frozen_dataclasses():
 NAMES = "name, axis, place, leaves, by_number, first, age, mass, shade, green"
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"name": 3}, "name: expected a name; found 3"),
-        ({"place": (1, 2)}, "place: expected three numbers [m]; found (1, 2)"),
-        ({"place": (10**5000, 2, 3)}, "place.0: expected a number [m]; found a huge integer"),
-        ({"leaves": [{}]}, "leaves.0.length: expected a number > 0 [m]; found none"),
-        ({"by_number": {"a": {}}}, "by_number: expected a whole number >= 0; found 'a'"),
-        ({"first": 3}, "first: expected a mapping with length, or nothing; found 3"),
-        ({"shade": "much"}, "shade: expected one of some, off; found 'much'"),
-        ({"gren": 1}, f"gren: expected one of {NAMES}; found an unknown key; did you mean green?"),
-        (
-            {"age": -1, "green": 1, "colour": 2},
-            f"colour: expected one of {NAMES}; found an unknown key "
-            "(also wrong or missing: age, green)",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("values", "message"), [
+    ({"name": 3}, "name: expected a name; found 3"),
+    ({"place": (1, 2)}, "place: expected three numbers [m]; found (1, 2)"),
+    ({"place": (10**5000, 2, 3)}, "place.0: expected a number [m]; found a huge integer"),
+    ({"leaves": [{}]}, "leaves.0.length: expected a number > 0 [m]; found none"),
+    ({"by_number": {"a": {}}}, "by_number: expected a whole number >= 0; found 'a'"),
+    ({"first": 3}, "first: expected a mapping with length, or nothing; found 3"),
+    ({"shade": "much"}, "shade: expected one of some, off; found 'much'"),
+    ({"gren": 1}, f"gren: expected one of {NAMES}; found an unknown key; did you mean green?"),
+    (
+        {"age": -1, "green": 1, "colour": 2},
+        f"colour: expected one of {NAMES}; found an unknown key "
+        "(also wrong or missing: age, green)",
+    ),
+])  # fmt: skip
 def test_complaints(values, message):
     for name, make in (("tree 'ash'", lambda x: Tree(**x)), ("here", lambda x: read(Tree, x))):
         given: dict[str, Any] = {"name": "ash"} | values

@@ -69,6 +69,7 @@ def test_masses_and_centres_are_mujocos(name):
         np.testing.assert_allclose(apart / np.linalg.norm(apart), up, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_what_modules_hold_is_told_apart_and_stands_where_it_must():
     """Bricks of equal mass and volume, and sealed volume that moves the centre of all of it."""
     brick = "{k}: {{type: FixedBrick, params: {{ballast: .01, ballast_position: [0, 0, {z}]}}}}"
@@ -118,6 +119,7 @@ def test_joints_move_as_the_table_says():
         assert moved @ axes[row["toward"]] > 0.9 * np.linalg.norm(moved)
 
 
+@pytest.mark.slow
 def test_page_needs_nothing_else(page):
     assert "a title &lt;b&gt;" in page and not re.search(r"https?:|<script|@import|url\(", page)
     assert all(x.startswith("data:") for x in re.findall(r'(?:src|href)="([^"]+)"', page))

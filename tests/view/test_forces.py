@@ -153,16 +153,12 @@ def _momentum_rate(robot: Robot, qpos, qvel, qacc, step=1e-5) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "laws",
-    [
-        {"buoyancy": "partial", "drag": "faces", **_SEA},
-        {"buoyancy": "mask", "drag": "lift_drag", "current": (0.2, 0.0, 0.1)},
-        {"buoyancy": "partial", "drag": "inertia_box", "current": (0.2, 0.0, 0.1)},
-        {"buoyancy": "off", "drag": "ellipsoid", "current": (0.2, 0.0, 0.1)},
-    ],
-    ids=lambda laws: laws["drag"],
-)
+@pytest.mark.parametrize("laws", [
+    {"buoyancy": "partial", "drag": "faces", **_SEA},
+    {"buoyancy": "mask", "drag": "lift_drag", "current": (0.2, 0.0, 0.1)},
+    {"buoyancy": "partial", "drag": "inertia_box", "current": (0.2, 0.0, 0.1)},
+    {"buoyancy": "off", "drag": "ellipsoid", "current": (0.2, 0.0, 0.1)},
+], ids=lambda laws: laws["drag"])  # fmt: skip
 def test_sum_is_what_the_step_does(laws):
     """Newton, without added mass: d/dt Σ m v = Σ forces + weight, half in and half out of water."""
     robot = arm_robot(world(gravity=G, **laws))

@@ -51,6 +51,7 @@ def test_deep_down_nothing_is_left_of_it_and_entrained_water_knows_none():
     assert np.all(np.array(half.damping.linear) == 0)
 
 
+@pytest.mark.slow
 def test_shares_are_between_none_and_all_and_smooth():
     rng = np.random.default_rng(0)
     for up in rng.normal(size=(20, 3)):

@@ -88,27 +88,24 @@ timestep: 2e-3
     assert (still.shear, still.gust, still.waves, still.surface_tension) == (None, None, (), None)
 
 
-@pytest.mark.parametrize(
-    ("override", "field", "expected"),
-    [
-        ({"gravity": np.array([0.0, 0.0, -9.81])}, "gravity", 9.81),
-        ({"current": np.array([0.1, 0.2, 0.3])}, "current", (0.1, 0.2, 0.3)),
-        ({"buoyancy": False}, "buoyancy", "off"),
-        ({"drag": False}, "drag", "off"),
-        ({"bed": "off"}, "bed", None),
-        ({"bed": np.float64(-3)}, "bed", Bed(kind="flat", height=-3.0)),
-        # A mapping keeps what it does not name: the lake stays a lake.
-        ({"bed": {"friction": 0.2}}, "bed", dataclasses.replace(LAKE, friction=0.2)),
-        ({"lift_drag": {"cda": 0.1}}, "lift_drag", LiftDrag(cda=0.1)),
-        ({"shear": {"velocity": np.ones(3)}}, "shear", Shear((1.0, 1.0, 1.0))),
-        ({"gust": {"std": np.float32(0.5)}}, "gust", Gust((0.5, 0.5, 0.0))),
-        ({"gust": {"std": [0.1, 0, 0.2]}}, "gust", Gust((0.1, 0.0, 0.2))),
-        ({"waves": {"amplitude": 0, "period": 2}}, "waves", (Wave(0, period=2),)),
-        ({"waves": [Wave(0.1, 3), Wave(0.1, 4)]}, "waves", (Wave(0.1, 3), Wave(0.1, 4))),
-        ({"surface_tension": True}, "surface_tension", SurfaceTension()),
-        ({"surface_tension": {"gamma": 0.03}}, "surface_tension", SurfaceTension(0.03)),
-    ],
-)
+@pytest.mark.parametrize(("override", "field", "expected"), [
+    ({"gravity": np.array([0.0, 0.0, -9.81])}, "gravity", 9.81),
+    ({"current": np.array([0.1, 0.2, 0.3])}, "current", (0.1, 0.2, 0.3)),
+    ({"buoyancy": False}, "buoyancy", "off"),
+    ({"drag": False}, "drag", "off"),
+    ({"bed": "off"}, "bed", None),
+    ({"bed": np.float64(-3)}, "bed", Bed(kind="flat", height=-3.0)),
+    # A mapping keeps what it does not name: the lake stays a lake.
+    ({"bed": {"friction": 0.2}}, "bed", dataclasses.replace(LAKE, friction=0.2)),
+    ({"lift_drag": {"cda": 0.1}}, "lift_drag", LiftDrag(cda=0.1)),
+    ({"shear": {"velocity": np.ones(3)}}, "shear", Shear((1.0, 1.0, 1.0))),
+    ({"gust": {"std": np.float32(0.5)}}, "gust", Gust((0.5, 0.5, 0.0))),
+    ({"gust": {"std": [0.1, 0, 0.2]}}, "gust", Gust((0.1, 0.0, 0.2))),
+    ({"waves": {"amplitude": 0, "period": 2}}, "waves", (Wave(0, period=2),)),
+    ({"waves": [Wave(0.1, 3), Wave(0.1, 4)]}, "waves", (Wave(0.1, 3), Wave(0.1, 4))),
+    ({"surface_tension": True}, "surface_tension", SurfaceTension()),
+    ({"surface_tension": {"gamma": 0.03}}, "surface_tension", SurfaceTension(0.03)),
+])  # fmt: skip
 def test_overrides(override, field, expected):
     water = load_world("lake", **override)
     assert getattr(water, field) == expected
@@ -250,17 +247,14 @@ def test_wrong_tables(tmp_path, lines, message):
     assert found == f"world lake: current_field: {path}: {message}"
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"x": None}, "expected arrays x, y, z, velocity; found no x"),
-        ({"z": [-1.0, -4.0]}, "z: expected rising numbers [m]; found -4 after -1"),
-        (
-            {"velocity": VELOCITY[..., :2]},
-            "velocity: expected shape [3, 2, 2, 3], as x, y and z have it; found [3, 2, 2, 2]",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"x": None}, "expected arrays x, y, z, velocity; found no x"),
+    ({"z": [-1.0, -4.0]}, "z: expected rising numbers [m]; found -4 after -1"),
+    (
+        {"velocity": VELOCITY[..., :2]},
+        "velocity: expected shape [3, 2, 2, 3], as x, y and z have it; found [3, 2, 2, 2]",
+    ),
+])  # fmt: skip
 def test_wrong_arrays(tmp_path, changes, message):
     path = tmp_path / "flow.npz"
     np.savez(path, **{k: v for k, v in (ARRAYS | changes).items() if v is not None})
