@@ -709,7 +709,7 @@ def dump_config(config: Config, folder: str | Path | None = None) -> str:
     """
 
     def shorten(file: NamedFile) -> str:
-        path, root = Path(file.path), Path(folder or "").absolute()
+        path, root = Path(file.path), Path(os.path.abspath(folder or ""))
         if folder is None or not path.is_relative_to(root):
             return file.text
         return file.at(path.relative_to(root).as_posix())

@@ -64,7 +64,8 @@ LOGS = (INDIVIDUALS, GENERATIONS, EVENTS)
 """Files that only grow, a line at a time; a run that goes on cuts them to its checkpoint."""
 # A folder with nothing else was begun by a process that died while making it.
 _BEGINNING = {"inputs", "checkpoints", ".lock", "run.json"}
-_TEMPORARY = re.compile(r"\.\d+-")
+TEMPORARY = re.compile(r"\.\d+-")
+"""Names of half-written files begin like that."""
 
 
 @dataclass
@@ -179,6 +180,8 @@ class RunFolder(RunReader):
                     have = log.stat().st_size if log.exists() else 0
                     if have < position:
                         raise DamageError(f"{name} lacks lines: {have} bytes long")
+                    if position and _byte_at(log, position - 1) != b"\n":
+                        raise DamageError(f"{name} has no line that ends at byte {position}")
             except DamageError as error:
                 damaged[checkpoint.path.name] = str(error)
                 continue
@@ -193,7 +196,7 @@ class RunFolder(RunReader):
         Args:
             checkpoint: the checkpoint; None: the run's beginning.
         """
-        later = [path for path in self.path.rglob(".*") if _TEMPORARY.match(path.name)]
+        later = [path for path in self.path.rglob(".*") if TEMPORARY.match(path.name)]
         for log in (self.path / name for name in ("metrics.csv", *LOGS)):
             if checkpoint is None:
                 later.append(log)
@@ -297,11 +300,17 @@ def load_archive(folder: str | Path) -> tuple[Archive, list[LoggedIndividual]]:
     return found, find_individuals(run.path, [int(number) for number in found.ids[filled(found)]])
 
 
+def _byte_at(path: Path, position: int) -> bytes:
+    with path.open("rb") as file:
+        file.seek(position)
+        return file.read(1)
+
+
 def is_new_folder(folder: Path) -> bool:
     """Whether a folder is empty, or was being made by a process that has died."""
     if not folder.is_dir():
         return False
-    names = {path.name for path in folder.iterdir() if not _TEMPORARY.match(path.name)}
+    names = {path.name for path in folder.iterdir() if not TEMPORARY.match(path.name)}
     begun = ".lock" in names and not any(folder.glob("checkpoints/*"))
     return not names or (begun and names <= _BEGINNING)
 
@@ -313,7 +322,7 @@ def check_new_folder(folder: str | Path) -> None:
         InputError: there is a file, or a folder that is not empty.
     """
     folder = Path(folder)
-    if folder.exists() and not is_new_folder(folder):
+    if (folder.exists() or folder.is_symlink()) and not is_new_folder(folder):
         hint = "; continue it with --resume" if (folder / "run.json").exists() else ""
         found = f"files{hint}" if folder.is_dir() else "a file"
         raise InputError(f"--out {folder}", "a new or empty folder", found)

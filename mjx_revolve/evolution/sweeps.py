@@ -30,7 +30,7 @@ from mjx_revolve.evolution.interrupts import Interrupts
 from mjx_revolve.evolution.jobs import MakeFitness, WorkerError
 from mjx_revolve.evolution.progress import is_live
 from mjx_revolve.evolution.run import MakeExecutor, Run, check_search, check_unchanged
-from mjx_revolve.evolution.run_folder import RunFolder, is_new_folder, open_run_folder
+from mjx_revolve.evolution.run_folder import TEMPORARY, RunFolder, is_new_folder, open_run_folder
 from mjx_revolve.evolution.tensorboard import check_tensorboard
 from mjx_revolve.inputs.commands import check_output_folder, describe_refusal
 from mjx_revolve.inputs.errors import InputError, note, reading
@@ -204,7 +204,8 @@ def check_folder(folder: Path, sweep: Sweep) -> None:
         others = [x for x in read_sweep(folder).cases if x not in sweep.cases]
         if left := [name for name in others if (folder / name).is_dir()]:
             note(f"{folder}: runs of {', '.join(left)} stay, but are no part of this sweep")
-    if not (folder / SWEEP).is_file() and folder.is_dir() and any(folder.iterdir()):
+    held = [x for x in folder.iterdir() if not TEMPORARY.match(x.name)] if folder.is_dir() else []
+    if held and not (folder / SWEEP).is_file():
         raise InputError(f"--out {folder}", "a new or empty folder, or that of a sweep", "files")
 
 

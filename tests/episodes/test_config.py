@@ -141,7 +141,7 @@ def test_dump_reads_back_equal(folder):
     config = load_config(folder / "good.yaml", settings)
     (folder / "elsewhere" / "dumped.yaml").write_text(dump_config(config))
     assert load_config(folder / "elsewhere" / "dumped.yaml").model_dump() == config.model_dump()
-    inside = dump_config(config, folder)
+    inside = dump_config(config, folder / ".." / folder.name)
     assert "morphology: robot.yaml" in inside
     (folder / "inside.yaml").write_text(inside)
     assert load_config(folder / "inside.yaml").model_dump() == config.model_dump()

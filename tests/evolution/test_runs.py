@@ -312,6 +312,9 @@ def test_a_checkpoint_ahead_of_its_metrics_is_passed_over(run):
     checkpoint = run.load_checkpoint()
     assert checkpoint.meta["generation"] == 1
     assert "metrics.csv lacks lines" in checkpoint.damaged[0]
+    run.metrics_path.write_bytes(b"\xef\xbb\xbf" + run.metrics_path.read_bytes())
+    with pytest.raises(InputError, match="has no line that ends at byte"):
+        run.load_checkpoint()
 
 
 def test_a_checkpoint_ahead_of_its_logs_is_passed_over(run):
