@@ -122,13 +122,20 @@ def _check_users_controller(name: str, controller: object, plant: Plant) -> None
             known = f"any of {', '.join(OPTIONAL_SIGNALS)}"
             known += ", or modules such as 'at ID' and 'each TYPE'"
             raise InputError(f"{place}: signals", known, repr(signal))
-    lanes, rows = 3, plant.num_rows
+    lanes, rows = 7, plant.num_rows
     with reading(f"{place}: signals"):
         readings = jax.eval_shape(lambda: readings_at_rest(plant, lanes, controller.signals))
 
     def run(genes: jax.Array, time: jax.Array, sense: SensorReadings) -> Any:
         parameters = controller.decode(genes, plant)
         state = controller.init(parameters)
+        for x in jax.tree.leaves(state):
+            if not hasattr(x, "ndim"):
+                raise InputError("init", "a state of arrays [..., lanes]", repr(x))
+            if x.ndim and x.shape[-1] != lanes and jnp.issubdtype(x.dtype, jnp.floating):
+                raise InputError(
+                    "init", f"a state of arrays [..., lanes], here {lanes}", _shapes(x)
+                )
         return state, *controller.step(parameters, state, time, sense)
 
     genes, time = jnp.zeros((count, lanes), jnp.float32), jnp.zeros((), jnp.float32)
@@ -139,6 +146,8 @@ def _check_users_controller(name: str, controller: object, plant: Plant) -> None
     if getattr(targets, "shape", None) != (rows, lanes):
         found = list(targets.shape) if hasattr(targets, "shape") else type(targets).__name__
         raise InputError(f"{place}: step", f"targets [n, lanes], here [{rows}, {lanes}]", found)
+    if not jnp.issubdtype(targets.dtype, jnp.floating):
+        raise InputError(f"{place}: step", "targets that are real numbers", str(targets.dtype))
     if _shapes(before) != _shapes(after):
         alike = f"a state of the shapes that init gives, {_shapes(before)}"
         raise InputError(f"{place}: step", alike, _shapes(after))

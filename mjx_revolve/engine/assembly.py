@@ -26,6 +26,9 @@ FULL_TORQUE_ERROR = 0.05
 # Share of the servo's effort that its gears' viscous friction takes at the speed limit [-]. A
 # choice; it is also what damps the servo, which has no velocity gain of its own.
 FRICTION = 1 / 5
+# Share of the explicit springs with which a free robot at rest rings for ever that a step takes; in
+# other poses up to a tenth less rings. A choice.
+_CALM = 0.9
 # A ballast is a point mass; MuJoCo needs some size, and a millimetre adds no inertia [m].
 BALLAST_RADIUS = 1e-3
 
@@ -101,13 +104,16 @@ class Assembly:
         return meeting_pairs(self) if self.world.self_contact else np.zeros((0, 2), int)
 
     def with_split_springs(self, armature: float | np.ndarray = 0.0) -> Assembly:
-        """The same with the implicit part of each servo's spring, from its hinge and its limb.
+        """The same with the implicit part of each servo's spring, from its hinge and its robot.
 
         MuJoCo's Euler step takes the servo's spring explicitly and the joint's friction d
-        implicitly; it is well damped while k dt² is at most 1.7 (I + d dt). Only hinges that carry
-        next to nothing have stiffer servos. Drag that is extrapolated explicitly feeds what rings
-        in a few steps, so that springs are taken implicitly earlier there; a choice: with less
-        nothing is won.
+        implicitly; with its parent held still, a limb is well damped while k dt² is at most 1.7
+        (I + d dt). But nothing holds a robot: where what carries limbs is light, they swing
+        against it with less inertia than their own. The hinges of a free robot ring for ever
+        unless K dt² is less than 4 M + 2 D dt, with M the inertia that hinges move, all of them
+        free and dry, as limbs may leave the water. Drag that is extrapolated explicitly feeds what
+        rings in a few steps, so that springs are taken implicitly earlier there; a choice: with
+        less nothing is won.
 
         Args:
             armature: `[nbody]` of the hinges [kg·m²].
@@ -116,7 +122,14 @@ class Assembly:
         inertia = np.sum(self.axis * turned(about, self.axis), 1) + armature
         dt, share = self.world.timestep, 0.5 if is_extrapolated(self.world.drag) else 1.7
         most = share * (inertia / dt**2 + self.damping / dt)
-        return replace(self, implicit_stiffness=np.maximum(self.stiffness - most, 0.0))
+        explicit = np.minimum(self.stiffness, most)
+        for root in self.roots:
+            hinges = slice(root + 1, self.end[root])
+            more = 4 * armature / dt**2 + 2 * self.damping / dt
+            bound = 4 * hinge_inertias(self, root) / dt**2 + np.diag(more[hinges])
+            rings = np.linalg.eigvals(np.linalg.solve(bound, np.diag(explicit[hinges])))
+            explicit[hinges] *= min(1.0, _CALM / max(rings.real, default=_CALM))
+        return replace(self, implicit_stiffness=self.stiffness - explicit)
 
     @property
     def moved(self) -> np.ndarray:
@@ -172,6 +185,36 @@ class Assembly:
         corners = layout.corners()[touching] @ table.rotation[touching].swapaxes(1, 2)
         place = table.position[touching, None] + corners
         return np.repeat(table.body[touching], 8), place.reshape(-1, 3)
+
+
+def hinge_inertias(assembly: Assembly, root: int) -> np.ndarray:
+    """`[n, n]` what the n hinges of a robot move at rest, its core free [kg·m²].
+
+    The mass matrix without water, less what the core's own motion takes: Schur's complement.
+
+    Args:
+        assembly: of the robot.
+        root: the body that holds its core.
+    """
+    own = slice(root, assembly.end[root])
+    place, turn = assembly.position[own], assembly.rotation[own]
+    center = place + turned(turn, assembly.center[own])
+    # Spatial inertias about the core's origin, of each body and of its subtree, a run of bodies.
+    x = np.cross(np.eye(3), center[:, None])
+    linear = assembly.mass[own, None, None] * np.eye(3)
+    angular = turn @ assembly.inertia[own] @ turn.swapaxes(1, 2) - x @ linear @ x
+    each = np.block([[angular, x @ linear], [(x @ linear).swapaxes(1, 2), linear]])
+    first, last = np.arange(len(place)), assembly.end[own] - root
+    until = np.concatenate([np.zeros((1, 6, 6)), np.cumsum(each, 0)])
+    below = until[last] - until[first]
+    spin = turned(turn, assembly.axis[own])
+    moves = np.concatenate([spin, np.cross(place, spin)], 1)[1:]
+    momentum = turned(below[1:], moves)
+    carries = (first[:, None] <= first) & (first < last[:, None])
+    upper = np.where(carries[1:, 1:], moves @ momentum.T, 0.0)
+    whole = upper + np.triu(upper, 1).T
+    found: np.ndarray = whole - momentum @ np.linalg.solve(below[0], momentum.T)
+    return found
 
 
 def assemble(morphologies: Sequence[Morphology], world: World) -> Assembly:

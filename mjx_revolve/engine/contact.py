@@ -87,7 +87,7 @@ def bed_contact(
     Normal, with d the depth and ḋ the speed inwards: F_n = k max(0, d + dt ḋ) + c ḋ while the sum
     pushes outwards: a spring at the end of the step, k the bed's stiffness, and a damper, c = k
     times 10 ms. Tangential: Coulomb, F_t = -μ F_n v_t / √(v_t² + v_c²) with v_c = 1 mm/s, so
-    that on a slope the point creeps at v_c tan(slope) / μ and slides where that passes μ. Of the
+    that on a slope the point creeps at v_c r / √(1 - r²), r = tan(slope) / μ < 1. Of the
     normal force, friction takes what the spring bears already and what stops the point's own mass
     within the step: F_n itself, foreseen with the velocity before, is many times what a foot that
     lands is really pushed with, and so much grip would make crawlers a third faster at 5 ms.

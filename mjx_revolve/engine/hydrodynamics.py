@@ -32,6 +32,7 @@ from mjx_revolve.numerics.spatial import (
     Sym,
     Vec,
     add,
+    cast,
     cross,
     diagonal,
     dot,
@@ -173,7 +174,7 @@ def _differs_by_part(x: Scalar) -> bool:
 def _widener(parts: Parts, n: int, motion: BodyMotion) -> Sum:
     """Broadcasts a number to all parts of n bodies."""
     lanes = jnp.shape(motion.height)[-1]
-    return lambda x: jnp.broadcast_to(x, (parts.count, n, lanes))
+    return lambda x: jnp.broadcast_to(cast(x, motion.height), (parts.count, n, lanes))
 
 
 def _immerse(world: World, parts: Parts, motion: BodyMotion, water: Water, wide: Sum) -> _Immersion:

@@ -259,6 +259,9 @@ class Plant:
             `[n, lanes]`; 0 where a row is no actuator.
         """
         if isinstance(self.source, np.ndarray) and self.source.shape[-1] == 1:
+            if values.shape[0] != self.num_actuators:
+                known = f"one of this robot, of {self.num_actuators} hinges and thrusters"
+                raise InputError("controller", known, f"one of {values.shape[0]}")
             return values[self.source[:, 0]]
         padded = jnp.concatenate([values, jnp.zeros_like(values[:1])])
         return jnp.take_along_axis(padded, jnp.asarray(self.source), 0)

@@ -215,7 +215,9 @@ class EpisodeSpec(ABC, Generic[B]):
         shape, count = np.shape(population), self.num_genes
         if len(shape) in ranks and shape[-1] == count and 0 not in shape:
             genes = jnp.asarray(population)
-            return genes if jnp.issubdtype(genes.dtype, jnp.floating) else genes.astype(float)
+            if jnp.iscomplexobj(genes):
+                raise InputError("population", "real numbers", str(genes.dtype))
+            return genes if genes.dtype in (jnp.float32, jnp.float64) else genes.astype(float)
         if count == 0:
             none = "none, so that there are no genes to evolve"
             raise InputError("population", "bodies with a hinge or a thruster to control", none)

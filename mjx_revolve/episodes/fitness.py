@@ -293,7 +293,7 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
         """
         genes = genes if isinstance(genes, jax.Array) else np.asarray(genes)
         indices = self._indices(robot)
-        if genes.shape[-1] != len(indices):
+        if genes.shape[-1:] != (len(indices),):
             raise InputError("genes", f"[..., {len(indices)}]", list(genes.shape))
         shape = (*genes.shape[:-1], self.num_genes)
         if isinstance(genes, jax.Array):
@@ -305,6 +305,8 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
     def own_genes(self, genes: ArrayLike, robot: Robot) -> Any:
         """The inverse: those of `[..., num_genes]` that a body's own controller takes."""
         genes = genes if isinstance(genes, jax.Array) else np.asarray(genes)
+        if genes.shape[-1:] != (self.num_genes,):
+            raise InputError("genes", f"[..., {self.num_genes}]", list(genes.shape))
         return genes[..., self._indices(robot)]
 
     def _indices(self, robot: Robot) -> np.ndarray:
@@ -460,6 +462,9 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
         for robot in robots:
             if not isinstance(robot, Robot):
                 raise InputError("robots", "what `build` returns", type(robot).__name__)
+            if robot.world is not self.world and robot.world != self.world:
+                name = robot.morphology.name
+                raise InputError(f"robot {name!r}", "what `build` returns", "one of another world")
         bodies = pack_bodies(robots, self.capacity)
         if not self.touches:
             reach = max_distance(self.settings, self.world, bodies.figure)

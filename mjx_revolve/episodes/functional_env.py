@@ -19,6 +19,8 @@ from jaxtyping import PyTree
 from mjx_revolve.episodes.config import Config
 from mjx_revolve.episodes.environment import Environment, EnvironmentState, make_environment
 from mjx_revolve.episodes.fitness import make_fitness
+from mjx_revolve.episodes.starts import check_key
+from mjx_revolve.inputs.errors import InputError
 
 
 @jax.tree_util.register_dataclass
@@ -102,12 +104,16 @@ class FunctionalEnv:
 
     def reset(self, rng: jax.Array) -> WaterState:
         """An episode's start, which follows from the key alone."""
+        check_key(rng)
         state, seen = self._begin(jax.random.bits(rng), jnp.int32(0))
         zero = jnp.zeros((), seen.dtype)
         return WaterState(state, seen, zero, zero, {"score": zero}, {"truncation": zero})
 
     def step(self, state: WaterState, action: jax.Array) -> WaterState:
         """A control period with an action `[action_size]` between -1 and 1."""
+        action = jnp.asarray(action)
+        if action.ndim != 1:
+            raise InputError("action", f"{self.action_size} numbers", list(action.shape))
         after, seen, result = self._advance(state.pipeline_state, action)
         done = (result.terminated | result.truncated).astype(seen.dtype)
         return WaterState(

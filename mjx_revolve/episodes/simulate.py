@@ -179,6 +179,10 @@ def simulate(
     Raises:
         InputError: a shape or a number is wrong.
     """
+    if not isinstance(robot, Robot):
+        raise InputError("robot", "what `build_robot` returns", type(robot).__name__)
+    if isinstance(ctrl, Controller):
+        raise InputError("ctrl", "a controller with its genes, of `bind_genes`", "one without")
     model, dt = robot.mj_model, robot.world.timestep
     if key is not None:
         check_key(key)

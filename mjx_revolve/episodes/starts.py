@@ -63,7 +63,8 @@ def check_key(key: object) -> None:
     """
     dtype, shape = getattr(key, "dtype", None), getattr(key, "shape", None)
     typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
-    if not (shape == () if typed else dtype == jnp.uint32 and shape in ((2,), (4,))):
+    raw = jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0))).shape
+    if not (shape == () if typed else dtype == jnp.uint32 and shape == raw):
         raise InputError("key", "jax.random.key(SEED)", repr(key))
 
 

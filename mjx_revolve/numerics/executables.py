@@ -66,10 +66,11 @@ class StoredProgram:
     def _load(self, folder: Path, args: tuple[PyTree, ...]) -> Callable[..., PyTree]:
         leaves, tree = jax.tree.flatten((args, {}))
         shapes = tuple((x.shape, str(x.dtype), getattr(x, "weak_type", False)) for x in leaves)
-        if (tree, shapes) not in self._found:
+        key = tree, shapes, _modes()
+        if key not in self._found:
             path = folder / self._name(str(tree), shapes)
-            self._found[tree, shapes] = _load(path, tree) or self._compile(path, args)
-        found: Callable[..., PyTree] = self._found[tree, shapes]
+            self._found[key] = _load(path, tree) or self._compile(path, args)
+        found: Callable[..., PyTree] = self._found[key]
         return found
 
     def cache_size(self) -> int:
@@ -77,13 +78,7 @@ class StoredProgram:
         return len(self._found) + self._jitted._cache_size()
 
     def _name(self, *signature: object) -> str:
-        config: Any = jax.config
-        modes = (
-            config.jax_enable_x64,
-            config.jax_default_matmul_precision,
-            config.jax_threefry_partitionable,
-        )
-        host = runtime.host_key(), modes, fuses(), os.environ.get("XLA_FLAGS")
+        host = runtime.host_key(), *_modes(), os.environ.get("XLA_FLAGS")
         return hashlib.sha256(pickle.dumps((self._made_of, signature, host))).hexdigest()[:32]
 
     def _compile(self, path: Path, args: PyTree) -> Any:
@@ -123,6 +118,17 @@ def _keep(path: Path, made: Any) -> None:
     finally:
         with contextlib.suppress(OSError):
             beside.unlink(missing_ok=True)
+
+
+def _modes() -> tuple[Any, bool]:
+    """What may change within a process, and a program with it."""
+    config: Any = jax.config
+    modes = (
+        config.jax_enable_x64,
+        config.jax_default_matmul_precision,
+        config.jax_threefry_partitionable,
+    )
+    return modes, fuses()
 
 
 def _load(path: Path, tree: PyTree) -> Any:

@@ -61,8 +61,7 @@ def test_force_on_a_point():
 
 @pytest.mark.parametrize("dt", [0.02, 0.005, 0.00125])
 def test_a_landing_point_is_gripped_by_what_stops_it_at_any_step(dt):
-    """Friction's impulse is at most μ m v, however far the spring would have been pressed; and a
-    point that lies still has all of μ F_n."""
+    """Friction's impulse is at most μ m v at any depth; a point that lies still has all μ F_n."""
     mass, speed = 0.01, 0.3
     land = bed_contact(FLAT, jnp.zeros(1) - 1e-4, (0.0, 0.0, 1.0), (1.0, 0.0, -speed), mass, dt)
     assert 0 < -float(land[0][0][0]) * dt <= FLAT.friction * mass * speed * (1 + 1e-5)
@@ -72,8 +71,7 @@ def test_a_landing_point_is_gripped_by_what_stops_it_at_any_step(dt):
 
 @pytest.mark.parametrize("dt", [0.02, 0.005, 0.000625])
 def test_what_lands_does_not_bounce_whatever_stands_behind_the_point(dt):
-    """A point with a share of 1 g, and ten times as much behind it: at any step it lands at
-    .3 m/s, stays within 2 mm, and never comes out faster than at a sixth of that."""
+    """A share of 1 g, ten times as much behind: lands at .3 m/s, within 2 mm, out at a sixth."""
     mass, share = 0.01, 1e-3
     force = jax.jit(lambda d, v: bed_contact(FLAT, d, (0.0, 0.0, 1.0), (0.0, 0.0, v), share, dt))
     height, speed, deepest, fastest = 1e-3, -0.3, 0.0, -1.0

@@ -143,8 +143,7 @@ def test_a_hinge_ends_where_its_neighbours_meet():
 
 @pytest.mark.parametrize("timestep", [0.0125, 0.02])
 def test_a_hinge_that_is_pressed_against_its_end_lies_still(timestep):
-    """At long steps it lost its stop for what the servo adds to its speed within the step, and
-    trembled at .5 rad/s."""
+    """At long steps it lost its stop for what the servo adds within the step, and trembled."""
     robot = build_robot(fork(1, 0), load_world("lake", bed=None, timestep=timestep))
     targets = np.array([[0.78, -0.78, 0.78, 0.6], [-0.78, 0.78, 0.78, -0.6]])
     _, qpos, qvel, _ = march(robot, 4.0, *at_rest(robot, 4, -2.0), targets)

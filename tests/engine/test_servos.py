@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.random_bodies import random_body
-from laboratory import batch_engine, body, elbow_robot, world
+from laboratory import batch_engine, body, elbow_robot, read, world
 from mjx_revolve.body.morphology import trim_neutral
 from mjx_revolve.engine.assembly import FULL_TORQUE_ERROR
 from mjx_revolve.engine.batch import fit_capacity
@@ -117,16 +117,21 @@ def test_hinges_that_reverse_together_do_not_push_each_other_far_beyond_the_top_
     assert np.quantile(ratio[:, there], 0.5) > 0.3  # they do move
 
 
-@pytest.mark.long
-def test_light_limbs_come_to_rest_after_jumps_of_their_targets():
-    """At 20 ms, with springs that an explicit step could not hold.
+CHAIN = "body: {type: Core, children: {1: {type: ActiveHinge, children: {1: {type: ActiveHinge, "
+CHAIN += "children: {1: {type: FixedBrick, children: {1: {type: FixedBrick}}}}}}}}}"
 
-    As servos at their limit forgot their springs, limbs swung from limit to limit for ever, at 3
-    rad/s and more.
-    """
-    robot = build_robot(body("salamander"), load_world("lake", bed=None, timestep=0.02))
+
+@pytest.mark.slow
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize(("limbs", "timestep", "depth"), [
+    (read(CHAIN), 0.0125, 1), (body("snake"), 0.005, -3), (body("salamander"), 0.02, 1)
+])  # fmt: skip
+def test_limbs_come_to_rest_after_jumps_of_their_targets(limbs, timestep, depth):
+    """Those of a light base, with no water to slow them, and light ones at the torque's limit."""
+    robot = build_robot(limbs, load_world("lake", bed=None, gravity=0.0, timestep=timestep))
     jumps = np.random.default_rng(0).uniform(-0.78, 0.78, (8, robot.mj_model.nu))
-    targets = np.concatenate([np.repeat(jumps, 20, 0), np.zeros((150, robot.mj_model.nu))])
-    speeds = np.asarray(simulate(robot, targets, once=True).qvel)[:, 6:]
-    assert np.abs(speeds[:150]).max() > 2
-    assert np.abs(speeds[-50:]).max() < 1e-2
+    targets = np.repeat([*jumps, *0 * jumps], round(0.4 / timestep), 0)
+    start = np.where(np.arange(7 + len(jumps[0])) == 2, -depth, robot.start_qpos())
+    speeds = np.abs(np.asarray(simulate(robot, targets, qpos=start, once=True).qvel)[:, 6:])
+    assert speeds[: len(targets) // 2].max() > 2
+    assert speeds[-len(targets) // 8 :].max() < 0.1

@@ -189,8 +189,8 @@ def test_an_mjcf_of_capsules_and_two_hinges(tmp_path):
     geared = MJCF.replace("forcerange", "ctrlrange").replace("forcelimited", "ctrllimited")
     other = import_robot(write(tmp_path, geared, "geared.xml")).modules["knee"].hinge
     assert other.effort == 1.5
-    motor = '<motor joint="knee" gear="3" forcerange="-.5 .5" forcelimited="true"/>'
-    two = MJCF.replace(motor, motor + motor.replace('"-.5 .5"', '"-1 .2"'))
+    another = '<motor joint="knee" gear="3" forcerange="-1 .2" forcelimited="true"/></actuator>'
+    two = MJCF.replace("</actuator>", another)
     both = import_robot(write(tmp_path, two, "two.xml")).modules["knee"].hinge
     assert both.effort == pytest.approx(4.5)  # they add up, each by its stronger side
     assert found.missing == (
