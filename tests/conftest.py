@@ -9,10 +9,9 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
-# One cache of compiled programs for the session: its workers, the commands that tests run, and the
-# processes that they start, compile a program once, and the user's own cache stays as it is. XLA's
-# flags are part of a program's name there. Small programs are kept, too: there are thousands of
-# them. Set before JAX is loaded, which reads it then.
+# One cache of compiled programs for the session, its workers and the processes that they start; the
+# user's own stays as it is. XLA's flags are part of a program's name there. Small programs are kept,
+# too: there are thousands. Set before JAX is loaded, which reads it then.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="mjx_revolve_tests_")
@@ -96,8 +95,7 @@ def fresh_traces():
         jax.clear_caches()
 
 
-# Files are dealt out whole, in this order: those that take longest go first, so that no worker is
-# left alone with one at the end.
+# Files are dealt out whole, the longest first, so that no worker is left alone at the end.
 _LONGEST = (
     "test_step", "test_self_contact", "test_coevolution", "test_docs", "test_examples",
     "test_bodies_end_to_end", "test_fit", "test_end_to_end", "test_many_bodies", "test_energy",

@@ -30,9 +30,9 @@ def make_cpg(body: Plant | Robot, max_frequency: float = 2.0, amplitude: float =
     (Lan et al. 2021, Learning locomotion skills in evolvable robots, Neurocomputing 452). The
     system matrix is antisymmetric, so Σ x² + y² is constant. Target of hinge i: amplitude × half
     range × tanh(x_i), from the middle of its range. It starts at x = 0, y = 1: with all weights
-    zero nothing moves. From command to command it is exact, by the matrix exponential, so that its
-    frequencies depend neither on the rate nor on the world's step. Thrusters have no neighbours:
-    each has a constant command, half range × sin(gene).
+    zero nothing moves but to there. From command to command it is exact, by the matrix exponential,
+    so that its frequencies depend neither on the rate nor on the world's step. Thrusters have no
+    neighbours: each has a constant command, half range × sin(gene).
 
     Genes: one w per hinge, then one c per pair of neighbours, then one command per thruster;
     w = 2π f_max sin(gene), c = π f_max sin(gene).

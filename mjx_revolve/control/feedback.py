@@ -39,8 +39,8 @@ def make_feedback(body: Plant | Robot, depth: float = 1.0, gain: float = 2.0) ->
     command_i = middle + half range × clip(sin(b_i) + gain Σ_k sin(W_ik) feature_k, -1, 1), with
     features depth error (core above `depth` counts positive) [0.2 m], vertical velocity [0.1 m/s],
     roll and pitch (the vertical's y and x in the core's frame) [0.2], and angular velocity about
-    the core's three axes [0.5 rad/s], each divided by the size in brackets. Zero genes: nothing
-    moves.
+    the core's three axes [0.5 rad/s], each divided by the size in brackets. Zero genes: all in
+    the middle of its range.
 
     Args:
         body: a plant or a robot.

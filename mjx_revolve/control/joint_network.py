@@ -69,7 +69,8 @@ def make_joint_network(
     and targets fade in over half a second. If recurrent, hidden units are leaky and coupled,
     τ_k ḣ_k = -h_k + tanh((W x + R h)_k), τ_k from 0.02 to 1 s (a continuous-time recurrent
     network, Beer 1995, Adaptive Behavior 3, with bounded states). Thrusters have a v of their own,
-    no joint observations and no neighbours. Weights are 2 sin(gene): with zero genes nothing moves.
+    no joint observations and no neighbours. Weights are 2 sin(gene): with zero genes nothing moves
+    but to the middle of its range.
 
     Args:
         body: a plant or a robot.

@@ -63,7 +63,7 @@ class Assembly:
         damping: `[nbody]` friction of the hinge [N·m·s/rad].
         stiffness: `[nbody]` of the servo [N·m/rad].
         implicit_stiffness: `[nbody]` the part of it that is too stiff for an explicit step of the
-            limb [N·m/rad].
+            limb or the robot [N·m/rad].
         fluid: tables of the parts.
         thruster_row: `[nthruster]` their parts.
     """
@@ -128,7 +128,7 @@ class Assembly:
             more = 4 * armature / dt**2 + 2 * self.damping / dt
             bound = 4 * hinge_inertias(self, root) / dt**2 + np.diag(more[hinges])
             rings = np.linalg.eigvals(np.linalg.solve(bound, np.diag(explicit[hinges])))
-            explicit[hinges] *= min(1.0, _CALM / max(rings.real, default=_CALM))
+            explicit[hinges] *= _CALM / np.max(rings.real, initial=_CALM)
         return replace(self, implicit_stiffness=self.stiffness - explicit)
 
     @property

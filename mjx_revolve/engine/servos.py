@@ -53,7 +53,7 @@ def servo(
     line, the line itself; below it, where the step may lead onto it, the chord from here to the
     top speed, which lies below the curve, so that no push, however the hinges are coupled, drives
     a hinge past its top speed; elsewhere the push is constant. Of a spring that is too stiff for an
-    explicit step of the limb, a part acts in the middle of the steps before and after instead,
+    explicit step, a part acts in the middle of the steps before and after instead,
     linearly implicit (`spring_damping`).
 
     Args:

@@ -119,7 +119,8 @@ def fit_rigid(
     across = np.einsum("nm,nmi,nmj->nij", weight, x - middle[0][:, None], y - middle[1][:, None])
     if not planar:
         # Of marks on a line, the turn nearest to level: they say nothing of the roll about it.
-        across[:, 2, 2] += _LEVEL**2
+        line = np.linalg.svd(across, compute_uv=False)[:, 1] < _LEVEL**2
+        across[line, 2, 2] += _LEVEL**2
     u, _, v = np.linalg.svd(across)
     flip = np.ones((len(x), dims))
     flip[:, -1] = np.sign(np.linalg.det(u) * np.linalg.det(v))

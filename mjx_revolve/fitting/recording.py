@@ -179,7 +179,10 @@ def check_recording(recording: RobotRecording, robot: Robot) -> None:
         for name, signal in recording.signals.items():
             if not _SIGNAL.fullmatch(name):
                 raise InputError(name, _KNOWN, "a name of no meaning")
-            if (np.diff(signal.time) <= 0).any():
+            shapes = np.shape(signal.time), np.shape(signal.value)
+            if shapes[0] != shapes[1] or len(shapes[0]) != 1 or 0 in shapes[0]:
+                raise InputError(name, "[n] times and values", " and ".join(map(str, shapes)))
+            if not (np.isfinite(signal.time).all() and (np.diff(signal.time) > 0).all()):
                 raise InputError(f"{name}: time", "rising times", "others")
         _check_signals(recording.signals, robot)
 

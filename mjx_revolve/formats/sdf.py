@@ -255,7 +255,8 @@ def _is_solid(robot: Robot, part: PlacedPart) -> bool:
 
 
 def _is_lifted(robot: Robot, part: PlacedPart) -> bool:
-    return robot.fluid.buoyancy[part.row] != "off" and robot.fluid.volume[part.row] > 0
+    lifted = robot.fluid.buoyancy[part.row] != "off" and robot.fluid.volume[part.row] > 0
+    return lifted and _floats(robot)
 
 
 def _root(robot: Robot, link: Link) -> PlacedPart:
@@ -412,11 +413,11 @@ def _missing(robot: Robot, links: tuple[Link, ...]) -> list[tuple[object, str]]:
         (True, "tilt at the surface: Gazebo cuts boxes as if they stood level"),
         (True, "the share of drag and added mass that is lost above the surface"),
         (
-            True,
+            _floats(robot),
             "contact at the modules' true corners: the collision boxes are those of the buoyancy",
         ),
         (
-            _floats(robot) and not all(_is_lifted(robot, p) for x in links for p in x.parts),
+            any(p.part.contact and not _is_solid(robot, p) for link in links for p in link.parts),
             "contact of parts that the water does not lift",
         ),
         (

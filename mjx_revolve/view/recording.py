@@ -59,7 +59,7 @@ class ReplayRobot:
             raise InputError(f"robot {self.name!r}: time", "rising times", "others")
         if (np.linalg.norm(qpos[:, 3:7], axis=1) == 0).any():
             raise InputError(f"robot {self.name!r}: qpos", "quaternions", "one of length 0")
-        end = time[-1] if self.end is None else self.end
+        end = self.appears if self.end is None else self.end
         if not -np.inf < self.appears <= end < np.inf:
             found = f"{self.appears:g} to {end:g} s"
             raise InputError(f"robot {self.name!r}", "a finite end after its start", found)

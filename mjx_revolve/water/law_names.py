@@ -72,7 +72,7 @@ def _maps(value: Any) -> bool:
 @also({"type": "object", "additionalProperties": {"type": "number"}}, {"type": "null"})
 def _read_coefficients(value: Any) -> Any:
     """A mapping from names to numbers as sorted pairs, each within its coefficient's bounds."""
-    if value is None or value == ():
+    if value is None or value in ((), []):
         return ()
     if not _maps(value):
         raise ConstraintError("", "a mapping from coefficients to numbers", show(value))
@@ -133,7 +133,7 @@ def factor_names() -> dict[str, tuple[bool, float]]:
 
 def _read_factors(value: Any) -> Any:
     """A mapping from names to factors as sorted pairs."""
-    if value is None or value == ():
+    if value is None or value in ((), []):
         return ()
     if not _maps(value):
         raise ConstraintError("", "a mapping from coefficients to factors", show(value))
