@@ -10,7 +10,7 @@ from collections import Counter
 from pathlib import Path
 
 # One cache of compiled programs for the session, its workers and the processes that they start; the
-# user's own stays as it is. XLA's flags are part of a program's name there. Small programs are kept,
+# user's own stays as it is. XLA's flags are part of a program's name there. Small ones are kept,
 # too: there are thousands. Set before JAX is loaded, which reads it then.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
