@@ -22,6 +22,7 @@ from mjx_revolve.numerics.spatial import (
     Sym,
     Vec,
     add,
+    cast,
     cross,
     diagonal,
     dot,
@@ -203,8 +204,11 @@ def _at_points(
     for speed, axis in zip(water.current, motion.axes, strict=True):
         velocity = vadd(velocity, vscale(speed, axis))
     wide_normal, velocity = tuple(wide(x) for x in normal), tuple(wide(x) for x in velocity)
+    # Out of the water nothing carries a body.
+    dry = motion.height > water.surface_height
+    fall = jnp.where(dry, cast(world.gravity, motion.height), cast(points.fall, motion.height))
     force, stiff, grip = bed_contact(
-        world.bed, depth, wide_normal, velocity, points.mass, world.timestep, points.fall
+        world.bed, depth, wide_normal, velocity, points.mass, world.timestep, fall
     )
     return force, stiff, grip, normal, wide
 
