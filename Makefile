@@ -37,7 +37,7 @@ test-all: $(READY)  ## all tests: notebooks, the tutorial and more cases, too; t
 fuzz: $(READY)  ## malformed files of all kinds, drawn anew; N of each (default: 2000)
 	MJX_REVOLVE_FUZZ=$(or $(N),2000) $(RUN) -m pytest tests/inputs/test_fuzz.py
 
-test-quick: $(READY)  ## the quick tests, under two minutes
+test-quick: $(READY)  ## the quick tests, some two minutes
 	$(TEST) -m "not slow and not long"
 
 check: $(READY)  ## lint, format and types
