@@ -47,12 +47,13 @@ def count_trials(config: Config) -> int:
         config: of an evolution of bodies.
 
     Returns:
-        The number.
+        The number, with the evaluations of `selection.reevaluate`.
     """
     bodies, first = config.bodies, config.evolution.population_size
     assert bodies is not None
-    children = bodies.selection.offspring or first
-    return (first + (config.evolution.generations - 1) * children) * bodies.learning.trials
+    children, later = bodies.selection.offspring or first, config.evolution.generations - 1
+    again = bodies.selection.reevaluate * (first + later * (first + children))
+    return (first + later * children) * bodies.learning.trials + again
 
 
 def make_cases(settings: Sequence[str] = ()) -> dict[str, Case]:

@@ -223,6 +223,10 @@ def make_body_fitness(config: Config) -> BodyFitness:
         rng = np.random.default_rng(0)  # so that they are the same in all processes
         examples = [*seeds, *(genotype.develop(genotype.random(rng)) for _ in range(_EXAMPLES))]
         kinds = [modules[name] for name in (bodies.core, *bodies.modules)]
+        there = [*kinds, *(module.kind for seed in seeds for module in seed.modules)]
+        if not any(kind.hinge or any(part.thruster for part in kind.parts) for kind in there):
+            moving = "a type with a hinge or a thruster, as brains are to evolve"
+            raise InputError("bodies.modules", moving, ", ".join(bodies.modules))
         mixed = make_mixed_fitness(
             config, examples, bodies.max_hinges, modules=bodies.max_modules, kinds=kinds
         )

@@ -411,19 +411,18 @@ def found_colony(
 ) -> tuple[Colony, list[Event]]:
     """The first robots, all over the arena: seeds and their mutants, then random ones.
 
-    A robot for which no free position is found leaves its number unused.
+    A robot for which no free position is found is left out; the next one has its number.
     """
     events: list[Event] = []
     count = rules.colony.birth.initial
     for founder in make_founders(
         rules.fitness, [rng] * count, colony.next_number, colony.generation, sow=True
     ):
+        founder = replace(founder, number=colony.next_number)
         placed = _place(colony, founder, time, rules, rng, everywhere=True)
-        if placed is None:
-            colony = replace(colony, next_number=colony.next_number + 1)
-            continue
-        colony, event = placed
-        events.append(event)
+        if placed is not None:
+            colony, event = placed
+            events.append(event)
     return colony, events
 
 

@@ -169,8 +169,10 @@ class GeneEvolution(Evolution[GeneSearch, _Proposal, Scored]):
             search.evaluations,
         )  # fmt: skip
 
-    def best(self, search: GeneSearch) -> Champion:
-        """The best of all generations."""
+    def best(self, search: GeneSearch) -> Champion | None:
+        """The best of all generations; None: every rollout failed."""
+        if not np.isfinite(search.elite_scores[0]):
+            return None
         origin = f"best of generation {search.elite_generations[0]}"
         return Champion(search.elites[0], float(search.elite_scores[0]), origin)
 

@@ -37,7 +37,7 @@ class Limits:
     Attributes:
         ready: until it has built and compiled its fitness.
         block: for a block, and at least ...
-        factor: ... this many times the median of those before it.
+        factor: ... this many times the median of those before it; `ready` for the first.
         tries: number of attempts to score a block [-].
     """
 
@@ -47,8 +47,12 @@ class Limits:
     tries: int = 3
 
     def timeout(self, times: Sequence[float]) -> float:
-        """For the next block, by the times of those before it [s]."""
-        return max(self.block, self.factor * statistics.median(times)) if times else self.block
+        """For the next block, by the times of those before it [s].
+
+        The first has as long as the example, which its worker has scored before it was ready.
+        """
+        usual = self.factor * statistics.median(times) if times else self.ready
+        return max(self.block, usual)
 
 
 LIMITS = Limits()
