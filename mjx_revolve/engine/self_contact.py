@@ -646,6 +646,9 @@ class _Contacts(NamedTuple):
         along = lambda hinges: _sum([hinges[k] * x for k, x in enumerate(every)])  # noqa: E731
         # Contact does no work: boxes part no faster than they met.
         most = 2 * jnp.maximum(-along(robots.steps), 0) / dt**2
+        # By as much as they near each other in the step, too, which levers at its end do not say of
+        # what turns: `_measure` asks for no more.
+        most = jnp.maximum(most, table.need)
         need = kept * self.need + (1 - kept) * jnp.minimum(table.need + along(change), most)
         moved = kept[:, None] * self.moved
         columns = _sum([moved[:, 6 + k][:, None] * x for k, x in enumerate(every)])

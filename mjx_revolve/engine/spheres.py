@@ -21,7 +21,7 @@ from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.spatial import SYM
 
 # The least radius as a share of a box's longest half edge, so that a rod has two spheres, and a
-# plate four, which stick out of it by as much. A choice.
+# plate five, which stick out of it by as much. A choice.
 _THICKNESS = 1 / 2
 
 
@@ -55,7 +55,8 @@ def sphere_box(half_size: Sequence[float]) -> tuple[np.ndarray, float]:
     Returns:
         `[n, 3]` centres, box frame [m], and their radius [m]: half the edge of the cube of equal
         volume, or a quarter of the longest edge, whichever is more. They fill the box like a grid;
-        a cube has one, which leaves out its corners.
+        a cube has one, which leaves out its corners; a plate has four and one in the middle,
+        without which small things pass between them.
     """
     half = np.asarray(half_size, float)
     radius = max(float(np.cbrt(half.prod())), float(half.max()) * _THICKNESS)
@@ -63,7 +64,10 @@ def sphere_box(half_size: Sequence[float]) -> tuple[np.ndarray, float]:
         return np.zeros((0, 3)), 0.0
     counts = np.maximum(np.round(half / radius), 1).astype(int)
     lines = [h * ((2 * np.arange(n) + 1) / n - 1) for h, n in zip(half, counts, strict=True)]
-    return np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 3), radius
+    centers = np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 3)
+    if np.sum(counts > 1) > 1:
+        centers = np.concatenate([centers, np.zeros((1, 3))])
+    return centers, radius
 
 
 def _balls(assembly: Assembly) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

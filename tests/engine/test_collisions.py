@@ -107,11 +107,11 @@ def push_of(depth, speed, mass, dt, parameters=None, slip=0.0):
 def test_spheres_of_known_boxes():
     centers, radius = sphere_box((0.02, 0.02, 0.02))
     assert radius == pytest.approx(0.02) and np.allclose(centers, 0)
-    # A rod has two, side by side; a plate four.
+    # A rod has two, side by side; a plate four, and one in their middle.
     centers, radius = sphere_box((0.04, 0.01, 0.01))
     assert radius == pytest.approx(0.02)
     assert sorted(centers[:, 0]) == pytest.approx([-0.02, 0.02])
-    assert len(sphere_box((0.03, 0.03, 0.001))[0]) == 4
+    assert len(sphere_box((0.03, 0.03, 0.001))[0]) == 5
     assert len(sphere_box((0.0, 0.0, 0.0))[0]) == 0
 
 
