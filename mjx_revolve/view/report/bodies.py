@@ -275,7 +275,9 @@ def viewer_command(record: RunRecord, *options: object) -> str:
 
 
 def inline_svg(svg: bytes) -> str:
-    """An SVG as a part of a page: without its head and size, its links without a new window."""
+    """An SVG as a part of a page: without its head and size, its links named, in this window."""
     text = svg[svg.index(b"<svg") :].decode().replace(' target="_blank"', "")
+    named = r'<a \1 aria-label="individual \2"'
+    text = re.sub(r'<a (xlink:href="[^"]*?(\d+)[^"\d]*")', named, text)
     start, end = text.split(">", 1)
     return re.sub(r' (width|height)="[^"]*"', "", start) + ">" + end

@@ -216,7 +216,8 @@ def count_modules(morphology: Morphology) -> tuple[list[list[Cell]], list[Cell]]
     """
     kinds = Counter(
         (m.kind.name, m.kind.mass, m.kind.volume,
-         tuple((part.name, _edges(part.boxes[0].size)) for part in m.kind.parts))
+         tuple((part.name, " and ".join(_edges(box.size) for box in part.boxes))
+               for part in m.kind.parts))
         for m in morphology.modules
     )  # fmt: skip
     rows: list[list[Cell]] = []

@@ -169,14 +169,13 @@ class ColonyParts {
     this.written = performance.now();
     const { page } = this, actor = page.actors[page.followed], robot = page.robots.there.get(page.followed);
     if (!actor) return page.describe(null);
-    if (!robot) return undefined;
     const { track, start, end, info } = actor, speed = track.speed(time - 0.5, time + 0.5);
-    const facts = {
-      born: page.clock(start), depth: `${(page.world.surface - robot.place.z).toFixed(2)} m`,
-      speed: isFinite(speed) ? `${speed.toFixed(3)} m/s` : "–", ...info,
+    const facts = { // before its birth and after its death it is nowhere
+      born: page.clock(start), depth: robot ? `${(page.world.surface - robot.place.z).toFixed(2)} m` : "–",
+      speed: robot && isFinite(speed) ? `${speed.toFixed(3)} m/s` : "–", ...info,
     };
     if (isFinite(end)) facts.gone = page.clock(end);
-    return page.describe(robot, facts);
+    return page.describe(actor, facts);
   }
 }
 
