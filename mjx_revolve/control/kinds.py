@@ -54,26 +54,14 @@ def find_controller(
     """
     if settings.rate is not None:
         paced = plant.at_rate(settings.rate)
-        _check_sampled(paced, settings, source)
+        limit = (paced.rate or settings.rate) / 2
+        if settings.fastest > limit:  # where the world's steps are longer than 1 / rate
+            most = f"waves of at most {limit:g} Hz, half as many as the world's steps"
+            raise InputError(f"{source}: controller.max_frequency", most, f"{settings.fastest:g}")
         shown = None if example is None else example.at_rate(settings.rate)
         found = _find(paced, settings, source, shown, body)
         return hold_commands(found, paced, settings.between == "ramp")
     return _find(plant, settings, source, example, body)
-
-
-def _check_sampled(paced: Plant, settings: Any, source: str) -> None:
-    """Raises `InputError` for waves that commands cannot sample, as the world's steps are long.
-
-    `ControllerConfig` has checked them against the rate in the settings.
-    """
-    rate, kind = paced.rate, settings.type
-    if rate is None or rate >= settings.rate or kind in ("feedback", "brain") or kind not in CONTROLLERS:
-        return
-    times = settings.harmonics if kind == "sine" else 1
-    if times * settings.max_frequency > rate / 2:
-        most = f"at most {rate / 2 / times:g}, to be sampled by a command in each of the world's "
-        most += f"steps ({rate:g} Hz)"
-        raise InputError(f"{source}: controller.max_frequency", most, f"{settings.max_frequency:g}")
 
 
 def _find(

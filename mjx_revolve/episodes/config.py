@@ -162,13 +162,19 @@ class ControllerConfig(Section):
     params: Annotated[dict[str, Any], File("data")] = Field({})
     """Settings of a function of the user's own, which reads them as `settings.params`."""
 
+    @property
+    def fastest(self) -> float:
+        """The highest frequency of waves that are to be sampled, 0 where there are none [Hz]."""
+        if self.type in ("feedback", "brain") or self.is_user_code:
+            return 0.0
+        return self.max_frequency * (self.harmonics if self.type == "sine" else 1)
+
     @model_validator(mode="after")
     def _check(self) -> ControllerConfig:
         self.refuse_params(self.params)
-        times = self.harmonics if self.type == "sine" else 1
-        slow = self.rate is not None and times * self.max_frequency > self.rate / 2
-        if slow and self.type not in ("feedback", "brain") and not self.is_user_code:
+        if self.rate is not None and self.fastest > self.rate / 2:
             most = f"at most half of controller.rate ({self.rate:g} Hz), to be sampled by it"
+            times = round(self.fastest / self.max_frequency)
             most += f", of the last of {times} harmonics" if times > 1 else ""
             raise ConstraintError("max_frequency", most, f"{self.max_frequency:g}")
         for name in dict.fromkeys(x for kind in CONTROLLERS.values() for x in kind.settings):
