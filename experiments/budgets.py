@@ -13,13 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.common import ROOT, as_numbers
-from experiments.studies import (
-    BASE,
-    Case,
-    describe_runs,
-    draw_outcomes,
-    study_main,
-)
+from experiments.studies import BASE, Case, describe_runs, draw_outcomes, study_main
 from mjx_revolve.episodes.config import Config, load_config
 from mjx_revolve.inputs.commands import run_command
 from mjx_revolve.inputs.files import write_atomic

@@ -16,12 +16,7 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from experiments.common import as_numbers
-from experiments.studies import (
-    Case,
-    describe_runs,
-    draw_outcomes,
-    study_main,
-)
+from experiments.studies import Case, describe_runs, draw_outcomes, study_main
 from mjx_revolve.body.descriptors import UNITS
 from mjx_revolve.episodes.measure_table import MEASURES
 from mjx_revolve.inputs.commands import run_command
@@ -30,13 +25,7 @@ from mjx_revolve.view.body_pictures import plot_bodies
 from mjx_revolve.view.convergence import draw_scores
 from mjx_revolve.view.outcomes import Figures, Outcome, by_case, write_csv
 from mjx_revolve.view.plots import WIDE, figure_png, in_style, new_figure, panels
-from mjx_revolve.view.statistics import (
-    ALPHA,
-    Comparison,
-    compare,
-    interval,
-    smallest_p,
-)
+from mjx_revolve.view.statistics import ALPHA, Comparison, compare, interval, smallest_p
 
 CURRENT = 0.05  # m/s along x, of `current`; about what a small swimmer can keep up with, a choice
 # A pond that bodies of 0.2 to 0.3 m must notice: their core starts 0.15 m from surface and bed, and
@@ -56,13 +45,7 @@ ENVIRONMENTS: dict[str, Case] = {
     ),
     "bed": Case(
         "on the lake's bed; bodies are not trimmed, so they sink",
-        (
-            "world=lake",
-            "trim=none",
-            "task.type=crawl",
-            "task.start_attitude=level",
-            _SWUM,
-        ),
+        ("world=lake", "trim=none", "task.type=crawl", "task.start_attitude=level", _SWUM),
     ),
     "current": Case(
         f"2 m below the lake's surface in a current of {CURRENT:g} m/s; progress against it counts",

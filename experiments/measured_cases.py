@@ -102,11 +102,7 @@ def forces(robot: Robot, velocity: Any, degrees: Any = 0.0, flow: Water | None =
 
 
 def loads(
-    robot: Robot,
-    velocity: Any,
-    degrees: Any = 0.0,
-    turning: Any = 0.0,
-    flow: Water | None = None,
+    robot: Robot, velocity: Any, degrees: Any = 0.0, turning: Any = 0.0, flow: Water | None = None
 ) -> Any:
     """Forces and torques on a body whose motion is prescribed.
 
@@ -574,8 +570,7 @@ def section_in_waves(
     """Amplitudes of the section in heave [mm] and roll [deg], over the last ten periods."""
     waves = [{"amplitude": data.WAVE_AMPLITUDE, "wavelength": wavelength(xi)}]
     robot = body(
-        "ShipSection",
-        _flume(waves=waves, water_depth=data.FLUME_DEPTH, near_surface=near_surface),
+        "ShipSection", _flume(waves=waves, water_depth=data.FLUME_DEPTH, near_surface=near_surface)
     )
     omega = np.sqrt(2 * xi * G / data.SECTION_BREADTH)
     time, q, *_ = march(robot, duration, *at_rest(robot, 1, -_SUNK), every=4)

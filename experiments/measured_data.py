@@ -228,10 +228,7 @@ class Flapping(NamedTuple):
 
 
 FOIL_SPEED, FOIL_HEAVE, FOIL_PIVOT = 0.4, 0.075, 1 / 3  # U [m/s], h [m], pivot behind the nose [c]
-FLAPPING = (
-    Flapping("Schouveiler", 0.25, 15.0, 0.32, 0.73),
-    Flapping("Read", 0.6, 35.0, 2.4, 0.43),
-)
+FLAPPING = (Flapping("Schouveiler", 0.25, 15.0, 0.32, 0.73), Flapping("Read", 0.6, 35.0, 2.4, 0.43))
 """NACA 0012, chord .1 m, span .6 m. L. Schouveiler, F. S. Hover and M. S. Triantafyllou 2005; D. A.
 Read, F. S. Hover and M. S. Triantafyllou 2003, its largest thrust. Second hand: three places agree
 on the numbers, the papers themselves could not be read."""

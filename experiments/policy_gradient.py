@@ -184,11 +184,7 @@ def learn(
 
 
 def train(
-    env: Any,
-    seconds: float,
-    seed: int,
-    settings: Settings,
-    say: Callable[[str], None],
+    env: Any, seconds: float, seed: int, settings: Settings, say: Callable[[str], None]
 ) -> tuple[Any, list[dict[str, float]]]:
     """Learns for a while.
 

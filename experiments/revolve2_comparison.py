@@ -28,12 +28,7 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from experiments.common import make_folder, make_parser, write_results
-from mjx_revolve import (
-    load_modules,
-    load_morphology,
-    make_morphology,
-    prepare_process,
-)
+from mjx_revolve import load_modules, load_morphology, make_morphology, prepare_process
 from mjx_revolve.body import Morphology
 from mjx_revolve.episodes import Task, Track, start_on_bed
 from mjx_revolve.episodes.config import make_config
@@ -54,10 +49,7 @@ DRY = {
     "bed": {"kind": "flat", "height": 0.0, "friction": FRICTION},
 }  # fmt: skip
 WET = {"name": "lake", "bed": {"kind": "flat", "height": -3.0, "friction": FRICTION}}
-WORLDS: dict[str, dict[str, Any]] = {
-    "ours, dry": DRY,
-    "ours, under water": WET,
-}
+WORLDS: dict[str, dict[str, Any]] = {"ours, dry": DRY, "ours, under water": WET}
 
 
 def _net_way(track: Track, settings: Any) -> jax.Array:

@@ -308,11 +308,7 @@ def describe_runs(
     ]
 
 
-def draw_outcomes(
-    axes: Axes,
-    cases: Mapping[str, Sequence[Outcome]],
-    label: str,
-) -> None:
+def draw_outcomes(axes: Axes, cases: Mapping[str, Sequence[Outcome]], label: str) -> None:
     """Draws `draw_curves` of runs by case over evaluated individuals; `label` names the score."""
     curves = {name: [(o.metrics["evaluations"], o.metrics["champion"]) for o in outcomes]
               for name, outcomes in cases.items()}  # fmt: skip

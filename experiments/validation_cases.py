@@ -26,11 +26,7 @@ from mjx_revolve.water.buoyancy import cut_box
 from mjx_revolve.water.flow import gust_path
 from mjx_revolve.water.laws import as_components
 from mjx_revolve.water.lift_drag import lift_drag
-from mjx_revolve.water.mujoco_drag import (
-    ellipsoid,
-    ellipsoid_numbers,
-    inertia_box,
-)
+from mjx_revolve.water.mujoco_drag import ellipsoid, ellipsoid_numbers, inertia_box
 from mjx_revolve.water.plates import LiftDrag
 from mjx_revolve.water.world import load_world
 

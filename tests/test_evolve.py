@@ -1,7 +1,4 @@
-"""The command line, on fitnesses that cost nothing: runs, stops, resumes, mistakes, TensorBoard.
-
-Bits are compared within one process or on one machine with the same thread settings, as promised.
-"""
+"""The command line, on fitnesses that cost nothing: runs, stops, resumes, mistakes, TensorBoard."""
 
 import errno
 import json

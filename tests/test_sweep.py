@@ -1,7 +1,4 @@
-"""Sweeps, on fitnesses that cost nothing: what is run, stopped, killed, continued and reported.
-
-Bits are compared within one process or on one machine with the same thread settings, as promised.
-"""
+"""Sweeps, on fitnesses that cost nothing: what is run, stopped, killed, continued and reported."""
 
 import csv
 import os

@@ -17,7 +17,9 @@ min(A / KC + B, most) / C_d of a long plate: what plates of other aspect ratios 
 Steady flow has σ = 0, and the steady law. The factor is never below 1 and even in v, so that drag
 opposes every motion; all four know velocities through the water only, so that a current changes
 nothing. They are stepped exactly for a velocity that holds for the step. Out of the water a plate
-forgets: v counts with its submerged share.
+forgets: v counts with its submerged share. Share and KC are ratios, which the least motion of a
+middle has, too; where turning moves a plate's strips faster than its middle, by a factor s, the
+share is less by s⁻², down to the steady drag of a plate that turns about its middle (a choice).
 
 Beside that a thin part is one of a chain, a rod or a compact one (`cross_flow`), but for its steady
 drag, which rises with its aspect ratio. The factor holds for the force across it, by strips where
@@ -35,7 +37,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mjx_revolve.numerics.lazy import jnp
-from mjx_revolve.numerics.spatial import Scalar, dot, mul
+from mjx_revolve.numerics.spatial import Scalar, cross, dot, mul
 from mjx_revolve.water.coefficients import TODAY
 from mjx_revolve.water.cross_flow import CROSS_FLOW, CrossFlowNumbers, chain_shares, split_drag
 from mjx_revolve.water.face_drag import FACES
@@ -96,7 +98,16 @@ def _factor(flow: PartFlow, numbers: PlateWakeNumbers) -> Scalar:
     number = 2 * np.pi * reach / numbers.width
     swinging = jnp.minimum(_A / jnp.maximum(number, 1e-6) + _B, _MOST) / _LONG
     whole = changing + mean * mean
-    share = changing / jnp.where(whole > 0, whole, 1)
+    v = dot(flow.velocity, numbers.normal)
+    # The gradient at rest, where there is no force, is that of plates that have hardly moved.
+    known = whole > 0
+    share = jnp.where(known, changing / jnp.where(known, whole, 1), jnp.where(v == 0, 1.0, 0.0))
+    spin = dot(cross(flow.angular_velocity, numbers.along), numbers.normal)
+    turning = mul(numbers.reach, spin)
+    turning = turning * turning
+    moving = v * v + whole
+    turned = turning > moving
+    share = share * jnp.where(turned, moving / jnp.where(turned, turning, 1), 1)
     return 1 + mul(numbers.thin, share * (swinging - 1))
 
 

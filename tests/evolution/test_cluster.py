@@ -1,7 +1,4 @@
-"""A Dask cluster: a real scheduler and real workers on the loopback, which come, go, die and hang.
-
-The tests share them, in the order in which they stand here.
-"""
+"""A Dask cluster: real scheduler and workers on the loopback, which come, go, die and hang."""
 
 import os
 import shutil

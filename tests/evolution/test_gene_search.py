@@ -1,7 +1,4 @@
-"""Strategies and the search over genes, on fitnesses that cost nothing.
-
-Bits are compared within one process or on one machine with the same thread settings, as promised.
-"""
+"""Strategies and the search over genes, on fitnesses that cost nothing."""
 
 import re
 from dataclasses import replace

@@ -1,7 +1,4 @@
-"""Malformed files: each is read as something valid, or refused in one line; nothing else happens.
-
-`tests/malformed.py` has the files and what must be true; `make fuzz` looks for more.
-"""
+"""Malformed files: each is read as something valid, or refused in one line; nothing else happens."""
 
 import dataclasses
 import json

@@ -65,6 +65,25 @@ def past(law, numbers, velocities, dt, submerged=1.0):
     return jax.lax.scan(step, first, jnp.asarray(velocities))
 
 
+def test_the_least_motion_changes_neither_force_nor_gradient():
+    """Share and reach of the wake are ratios, which what turns about its middle has not."""
+    slat = numbers_of(PLATE_WAKE, box_robot((0.002, 0.03, 0.3), 0.5, WATER))
+    law = lambda memory, *v: PLATE_WAKE.force(PartFlow(*v, 1.0, memory), slat, WATER)  # noqa: E731
+    spin, side, still, little = (
+        (0.0, 3.0, 0.0),
+        jnp.array((0, 0.2, 0)),
+        (0.0,) * 4,
+        (1e-9, 0.0, 0.0),
+    )
+    moved, _ = past(PLATE_WAKE, slat, [little] * 50, 0.005)
+    expected = law(still, (0.0,) * 3, spin).torque[1]
+    np.testing.assert_allclose(law(moved, little, spin).torque[1], expected, rtol=1e-6)
+    gradient = jax.jacfwd(lambda v: law(still, tuple(v), (0.0,) * 3).force[0])(side)
+    begun, _ = past(PLATE_WAKE, slat, [little], 1e-6)
+    found = law(begun, (1e-9, 0.2, 0.0), (0.0,) * 3).force[0] / 1e-9
+    np.testing.assert_allclose(gradient[0], found, rtol=1e-4)
+
+
 def test_thin_parts_alone_are_plates():
     assert thinness([0.004, 0.2, 0.1]) == 1.0
     assert thinness([0.1, 0.015, 0.2]) == pytest.approx(0.5)
