@@ -1,4 +1,4 @@
-"""Malformed files: each is read as something valid, or refused in one line; nothing else happens."""
+"""Malformed files: each is read as something valid, or refused in one line, and no more."""
 
 import dataclasses
 import json
