@@ -213,8 +213,7 @@ def hinge_inertias(assembly: Assembly, root: int) -> np.ndarray:
     carries = (first[:, None] <= first) & (first < last[:, None])
     upper = np.where(carries[1:, 1:], moves @ momentum.T, 0.0)
     whole = upper + np.triu(upper, 1).T
-    found: np.ndarray = whole - momentum @ np.linalg.solve(below[0], momentum.T)
-    return found
+    return whole - momentum @ np.linalg.solve(below[0], momentum.T)
 
 
 def assemble(morphologies: Sequence[Morphology], world: World) -> Assembly:
@@ -323,12 +322,10 @@ def _weigh(
 
 def _diagonal(x: np.ndarray) -> np.ndarray:
     """`[n, 3]` to `[n, 3, 3]`."""
-    diagonal: np.ndarray = x[:, None] * np.eye(3)
-    return diagonal
+    return x[:, None] * np.eye(3)
 
 
 def _steiner(mass: np.ndarray, arm: np.ndarray) -> np.ndarray:
     """`[n, 3, 3]` inertias of point masses at `[n, 3]` arms."""
     square = np.sum(arm**2, 1)[:, None, None] * np.eye(3)
-    about: np.ndarray = mass[:, None, None] * (square - arm[:, :, None] * arm[:, None])
-    return about
+    return mass[:, None, None] * (square - arm[:, :, None] * arm[:, None])

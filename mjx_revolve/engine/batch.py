@@ -657,7 +657,7 @@ def pack_bodies(
         kinds = {"f": dtype, "i": np.int32, "b": bool}
         return x.astype(kinds[x.dtype.kind])[..., pick]
 
-    packed: PackedBodies = jax.tree.map(
+    return jax.tree.map(
         wide,
         PackedBodies(
             root=root,
@@ -674,7 +674,6 @@ def pack_bodies(
             **hanging,
         ),
     )
-    return packed
 
 
 def distinct(robots: Sequence[Robot]) -> tuple[list[Robot], np.ndarray]:

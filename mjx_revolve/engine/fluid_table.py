@@ -86,15 +86,13 @@ class FluidTable(PartShapes):
     @property
     def face_area(self) -> Float[np.ndarray, "npart 3"]:
         """What the water reaches of a face across each axis [m²]."""
-        area: np.ndarray = self.exposed * self.silhouette
-        return area
+        return self.exposed * self.silhouette
 
     @property
     def lifted(self) -> Float[np.ndarray, " npart"]:
         """Volume of what the water lifts of each part [m³]."""
         lifts = [find_buoyancy_law(name).lifts for name in self.buoyancy]
-        volume: np.ndarray = self.volume * np.array(lifts, float)
-        return volume
+        return self.volume * np.array(lifts, float)
 
     @property
     def coupled(self) -> np.ndarray:

@@ -95,8 +95,7 @@ def frames_of(trees: BatchedTrees, state: State) -> Frames:
         velocity, angular = matvec(axes, motion.velocity), matvec(axes, motion.angular_velocity)
         return Frames(axes, (*motion.xy, motion.height), velocity, angular)
 
-    found: Frames = fuse(find)(state._replace(qacc_prev=(), command=(), submerged=()))
-    return found
+    return fuse(find)(state._replace(qacc_prev=(), command=(), submerged=()))
 
 
 def penalty_force(
@@ -696,8 +695,7 @@ class _Contact:
 
         some = jnp.where(pairs > 0, jnp.inf, 0).astype(nothing.dtype)
         start = jnp.int32(0), jnp.zeros((4, room), nothing.dtype), nothing, some
-        total: jax.Array = jax.lax.while_loop(wanted, sweep, start)[2]
-        return total
+        return jax.lax.while_loop(wanted, sweep, start)[2]
 
 
 def _side(frame: jax.Array, numbers: jax.Array) -> _Side:

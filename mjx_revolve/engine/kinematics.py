@@ -262,5 +262,4 @@ def mass_centers(robot: Robot, qpos: Float[np.ndarray, "n nq"]) -> Float[np.ndar
     poses: Any = body_poses(robot, qpos)  # type: ignore[arg-type]  # of NumPy's arrays
     (place, turn), mass = poses, robot.assembly.mass
     centers = place + np.einsum("nbij,bj->nbi", turn, robot.assembly.center)
-    found: np.ndarray = np.einsum("b,nbi->ni", mass, centers) / mass.sum()
-    return found
+    return np.einsum("b,nbi->ni", mass, centers) / mass.sum()

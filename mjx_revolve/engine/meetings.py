@@ -38,8 +38,7 @@ class Boxes(NamedTuple):
             found.append(jax.tree.map(partial(_flat, level, own.count, dtype), numbers))
         lanes = max(x.shape[-1] for x in jax.tree.leaves(found))
         wide = lambda x: jnp.broadcast_to(x, (len(x), lanes))  # noqa: E731
-        joined: Boxes = jax.tree.map(lambda *x: jnp.concatenate(list(map(wide, x))), *found)
-        return joined
+        return jax.tree.map(lambda *x: jnp.concatenate(list(map(wide, x))), *found)
 
 
 def _is_identity(rotation: Mat) -> bool:

@@ -225,8 +225,7 @@ class Plant:
             InputError: there is no such module, or robots differ.
         """
         if place in self.mounts:
-            found: Sites = self.mounts[place]
-            return found
+            return self.mounts[place]
         if self.modules is None:
             raise InputError(
                 "expected `each` a type of modules in place of `at`, as bodies differ; found "

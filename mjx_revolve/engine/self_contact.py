@@ -688,8 +688,7 @@ class _Contacts(NamedTuple):
             taken = weight(diagonal > 0, diagonal)
             inverse = taken / (diagonal + 1 - taken)
             step = fuse(lambda now: sweep(columns, inverse, now), inline=True)
-            found: jax.Array = _while_any(1, _SWEEPS, step, (force, moving), steady)[0]
-            return found
+            return _while_any(1, _SWEEPS, step, (force, moving), steady)[0]
 
         def join(now: Any) -> Any:
             """One contact more of each robot that misses any."""

@@ -299,8 +299,7 @@ def _base_inertias(assembly: Assembly) -> np.ndarray:
     # How the core's origin would move.
     pace = np.cross(place, spin)
     about = spin * (turned(angular, spin) + 2 * turned(cross, pace)) + pace * turned(linear, pace)
-    total: np.ndarray = np.sum(about, 1)
-    return total
+    return np.sum(about, 1)
 
 
 def _read_bodies(assembly: Assembly, frame: np.ndarray) -> tuple[Any, ...]:
@@ -441,8 +440,7 @@ def _read_parts(assembly: Assembly, frame: np.ndarray, drag: Mapping[str, Any]) 
         x = _end(x, blank)
         return x if x.ndim == 1 else _vec(x) if x.ndim == 2 else _mat(x)
 
-    found: Parts = map_fields(column, parts)
-    return found
+    return map_fields(column, parts)
 
 
 def _carried_about(

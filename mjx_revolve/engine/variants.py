@@ -135,5 +135,4 @@ def course_targets(course: np.ndarray, timestep: float) -> np.ndarray:
     rate = _RETURN / timestep
     speed = np.diff(course, axis=0) / timestep
     push = np.diff(speed, axis=0) / timestep
-    targets: np.ndarray = course[1:-1] + 2 / rate * speed[:-1] + push / rate**2
-    return targets
+    return course[1:-1] + 2 / rate * speed[:-1] + push / rate**2

@@ -59,8 +59,7 @@ class StoredProgram:
         folder = runtime.program_folder()
         args = jax.tree.map(jax.numpy.asarray, args)
         if self._made_of[0] is None or folder is None or not on_cpu():
-            compiled: Callable[..., PyTree] = self._jitted.lower(*args).compile()
-            return compiled
+            return self._jitted.lower(*args).compile()
         return self._load(folder, args)
 
     def _load(self, folder: Path, args: tuple[PyTree, ...]) -> Callable[..., PyTree]:
@@ -70,8 +69,7 @@ class StoredProgram:
         if key not in self._found:
             path = folder / self._name(str(tree), shapes)
             self._found[key] = _load(path, tree) or self._compile(path, args)
-        found: Callable[..., PyTree] = self._found[key]
-        return found
+        return self._found[key]
 
     def cache_size(self) -> int:
         """Number of executables, one for each signature of the arguments."""

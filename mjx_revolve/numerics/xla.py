@@ -524,8 +524,7 @@ def in_fused_calls(
     """
     if not fuses():
         return lambda *args: pack(fun(*unpack(*args)))
-    found: Callable[..., Any] = Graph(fun, examples).in_pieces(_piece_size(examples), pack, unpack)
-    return found
+    return Graph(fun, examples).in_pieces(_piece_size(examples), pack, unpack)
 
 
 def over_chunks(fun: Callable[[*Ts], R], lanes: int | None = None) -> Callable[[*Ts], R]:

@@ -201,8 +201,7 @@ def friction_share(speed: Scalar, length: Scalar, world: World) -> Scalar:
         return 0.0
     scale = mul(length, world.density / world.viscosity)
     reynolds = jnp.maximum(mul(speed, scale), _LEAST_REYNOLDS)
-    share: Scalar = friction_times_reynolds(reynolds) / reynolds
-    return share
+    return friction_times_reynolds(reynolds) / reynolds
 
 
 def _force(flow: PartFlow, numbers: CrossFlowNumbers, world: World) -> Drag:

@@ -225,8 +225,7 @@ class CurrentField:
 
     @property
     def _key(self) -> str:
-        digest: str = self.__dict__["_digest"]
-        return digest
+        return self.__dict__["_digest"]
 
 
 def _check_axis(name: str, axis: np.ndarray) -> None:

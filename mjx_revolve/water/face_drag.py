@@ -84,8 +84,7 @@ def split_axes(coefficient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def beside(faces: np.ndarray, edges: Any = 1.0) -> np.ndarray:
     """For each axis, the sum over the faces beside it; those across k are strips along j."""
     j, k, edges = [1, 2, 0], [2, 0, 1], np.broadcast_to(edges, faces.shape)
-    found: np.ndarray = faces[..., k] * edges[..., j] + faces[..., j] * edges[..., k]
-    return found
+    return faces[..., k] * edges[..., j] + faces[..., j] * edges[..., k]
 
 
 def quadratic_drag(rate: Scalar, coefficient: Scalar, share: Scalar) -> tuple[Scalar, Scalar]:

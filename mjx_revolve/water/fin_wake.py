@@ -140,8 +140,7 @@ def _incidence(flow: PartFlow, fin: FinWakeNumbers) -> tuple[Scalar, Scalar]:
 
 def _cast(fin: FinWakeNumbers, like: Any) -> FinWakeNumbers:
     """Constants in the dtype of what they meet."""
-    found: FinWakeNumbers = jax.tree.map(lambda x: cast(x, like), fin)
-    return found
+    return jax.tree.map(lambda x: cast(x, like), fin)
 
 
 def _force(flow: PartFlow, fin: FinWakeNumbers, world: World) -> Drag:

@@ -167,8 +167,7 @@ def shear_flow(shear: Shear, depth: Scalar) -> Vec:
         inside = share < 1
         left = jnp.where(inside, 1 - share, 1)
         profile = jnp.where(inside, left**shear.exponent, 0)
-    velocity: Vec = vscale(profile, shear.velocity)
-    return velocity
+    return vscale(profile, shear.velocity)
 
 
 def _cell(axis: np.ndarray, at: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -229,8 +228,7 @@ def field_flow(field: CurrentField, x: Scalar, y: Scalar, z: Scalar) -> Vec:
             return _pick(table, index)
         (stride, share), *rest = spans
         here, there = between(table, index, rest), between(table, index + stride, rest)
-        found: jax.Array = here + share * (there - here)
-        return found
+        return here + share * (there - here)
 
     tables = [field.velocity[..., i].reshape(-1).astype(dtype) for i in range(3)]
     return tuple(between(table, index, spans) if table.any() else 0.0 for table in tables)

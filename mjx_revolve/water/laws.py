@@ -131,8 +131,7 @@ def scale_numbers(numbers: T, factors: Mapping[str, Scalar]) -> T:
         factor = functools.reduce(operator.mul, (factors[name] for name in field.varied))
         return jax.tree.map(lambda x: mul(x, factor), value)
 
-    found: T = map_fields(scale, numbers)
-    return found
+    return map_fields(scale, numbers)
 
 
 def as_components(numbers: T) -> T:
@@ -141,8 +140,7 @@ def as_components(numbers: T) -> T:
     def split(field: PartField, x: Any) -> Any:
         return x if field.axes == "none" else tuple(np.moveaxis(np.asarray(x), -1, 0))
 
-    found: T = map_fields(split, numbers)
-    return found
+    return map_fields(split, numbers)
 
 
 @law_numbers

@@ -144,8 +144,7 @@ def slopes(p: LiftDrag | PlateNumbers, dtype: Any) -> Any:
 
 def wrapped(angle: Scalar) -> Scalar:
     """An angle of attack within ±90°: a plate works backwards, too."""
-    found: Scalar = angle - np.pi * jnp.round(angle / np.pi)
-    return found
+    return angle - np.pi * jnp.round(angle / np.pi)
 
 
 def coefficients(

@@ -159,8 +159,7 @@ def _geom_fluid(half_size: tuple[float, float, float]) -> np.ndarray:
     spec = mujoco.MjSpec()
     geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half_size)
     geom.fluid_ellipsoid, geom.fluid_coefs = 1, ELLIPSOID_COEFFICIENTS
-    found: np.ndarray = spec.compile().geom_fluid[0].copy()
-    return found
+    return spec.compile().geom_fluid[0].copy()
 
 
 def _numbers_of_ellipsoids(parts: PartShapes, world: World) -> EllipsoidNumbers:

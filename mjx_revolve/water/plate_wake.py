@@ -69,8 +69,7 @@ class PlateWakeNumbers(CrossFlowNumbers):
 def thinness(size: Any) -> np.ndarray:
     """`[...]` how thin boxes of edges `[..., 3]` are: 1 of a thin plate, 0 of a box."""
     thick, width, _ = np.moveaxis(np.sort(np.asarray(size, float)), -1, 0)
-    found: np.ndarray = np.clip(2 - thick / width / _THIN, 0, 1)
-    return found
+    return np.clip(2 - thick / width / _THIN, 0, 1)
 
 
 def _numbers(parts: PartShapes, world: World) -> PlateWakeNumbers:

@@ -210,8 +210,7 @@ def make_world(**fields: Any) -> World:
     Raises:
         InputError: an unknown field or a value out of range.
     """
-    world: World = read(World, fields)
-    return world
+    return read(World, fields)
 
 
 def load_world(name: str | Path, **overrides: Any) -> World:
