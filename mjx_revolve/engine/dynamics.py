@@ -31,7 +31,15 @@ from mjx_revolve.engine.self_contact import (
 from mjx_revolve.engine.servos import end_stop, servo, spring_damping
 from mjx_revolve.engine.state import State, effective_gravity, has_acceleration
 from mjx_revolve.engine.tree import Tree
-from mjx_revolve.numerics.articulated import eliminate_joint, solve_root, to_parent, upper
+from mjx_revolve.numerics.articulated import (
+    JointElimination,
+    eliminate_joint,
+    release_joint,
+    solve_root,
+    to_child,
+    to_parent,
+    upper,
+)
 from mjx_revolve.numerics.inertia import (
     Block,
     BodyMotion,
@@ -52,9 +60,7 @@ from mjx_revolve.numerics.spatial import (
     Vec,
     add,
     cross,
-    dot,
     full,
-    matTvec,
     matvec,
     mul,
     neg,
@@ -178,14 +184,10 @@ def accelerate(
         """Accelerations of bodies from those of their parents, and of their hinges."""
         (motion, rotation), speed, (joint, *_) = x
         assert level.hinges is not None
-        angular, linear = parent
+        carried = to_child(rotation, level.hinges.position, parent)
         coriolis = _coriolis(turning(motion), speed)
-        a = vadd(matTvec(rotation, angular), coriolis[0])
-        position = level.hinges.position
-        b = vadd(matTvec(rotation, vadd(linear, cross(angular, position))), coriolis[1])
-        hinge = sub(sub(joint.rest, dot(joint.row_a, a)), dot(joint.row_l, b))
-        hinge = mul(joint.inverse, hinge)
-        return _along(axis_of(motion), hinge, (a, b)), hinge
+        held = vadd(carried[0], coriolis[0]), vadd(carried[1], coriolis[1])
+        return release_joint(joint, axis_of(motion), held)
 
     hinges = tree.forward_pass(accelerate_joint, (angular, linear), moved, state.speed, saved)
     lanes, dtype = state.position[0].shape, state.position[0].dtype
@@ -203,11 +205,6 @@ def accelerate(
         clearance,
         pressed,
     )
-
-
-def _along(axis: tuple[Vec, Vec], hinge: Scalar, rest: tuple[Vec, Vec]) -> tuple[Vec, Vec]:
-    """Acceleration of a body by its hinge's along its axis, added to the rest."""
-    return vadd(rest[0], vscale(hinge, axis[0])), vadd(rest[1], vscale(hinge, axis[1]))
 
 
 class _Factors(NamedTuple):
@@ -269,11 +266,8 @@ def _make_respond(
     saved = tree.saved_at_lanes(factors.saved, lambda saved: (saved[0][:3], saved[2]), which)
     few = tree.at_lanes(which)
     # With which momenta turn.
-    velocities = (
-        ()
-        if symmetric
-        else (tree.saved_at_lanes(factors.moved, lambda moved: moved[0].midpoint_velocity, which),)
-    )
+    midpoint = lambda moved: moved[0].midpoint_velocity  # noqa: E731
+    velocities = () if symmetric else (tree.saved_at_lanes(factors.moved, midpoint, which),)
 
     def collect(_: Level, children: Any, turn: Any, place: Any, saved: Any, torque: Any) -> Any:
         """Bias forces, as the parents feel them."""
@@ -290,13 +284,10 @@ def _make_respond(
     def accelerate_joint(
         _: Level, parent: Any, turn: Any, place: Any, saved: Any, rest: Any, *velocity: Any
     ) -> Any:
-        angular, linear = parent
-        a = matTvec(turn, angular)
-        b = matTvec(turn, vadd(linear, cross(angular, place)))
-        (row_a, row_l, inverse), _column = saved
-        hinge = mul(inverse, sub(sub(rest, dot(row_a, a)), dot(row_l, b)))
         axis = _axis_ahead(velocity[0], dt) if velocity else _AXIS
-        return _along(axis, hinge, (a, b)), hinge
+        (row_a, row_l, inverse), _column = saved
+        joint = JointElimination(row_a, row_l, inverse, rest)
+        return release_joint(joint, axis, to_child(turn, place, parent))
 
     def respond(torque: jax.Array) -> jax.Array:
         bias, rests, _ = few.backward_pass(
@@ -371,13 +362,11 @@ def midpoint_forces(
     if not motion.midpoint or not dt:
         return water_forces(world, level, motion, gravity, water, thrusts, before)
     share = implicit_share(world, level, motion, water, dt)
+    begun = motion.angular_velocity, motion.velocity
     angular, linear = (
         vadd(v, vscale(sub(1, share), vsub(middle, v)))
-        for v, middle in zip(
-            (motion.angular_velocity, motion.velocity), motion.midpoint, strict=True
-        )
+        for v, middle in zip(begun, motion.midpoint, strict=True)
     )
-    begun = motion.angular_velocity, motion.velocity
     ahead = motion._replace(angular_velocity=angular, velocity=linear, begun=begun)
     external = water_forces(world, level, ahead, gravity, water, thrusts, before)
     if external.damping is None:

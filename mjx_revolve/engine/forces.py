@@ -39,8 +39,7 @@ from mjx_revolve.water.flow import Water
 def _in_current(tree: Tree, state: State, water: Water) -> tuple[BodyMotion, Any]:
     """Motion of the root and of the bodies below it, relative to the uniform current."""
     relative = state._replace(velocity=vsub(state.velocity, water.current))
-    root, below = forward_kinematics(tree, relative, True)
-    return root, below
+    return forward_kinematics(tree, relative, True)
 
 
 def servo_torque(tree: Tree, state: State, targets: Any) -> Float[Array, "rows lanes"]:
@@ -114,8 +113,7 @@ def external_force(tree: Tree, state: State, water: Water, thrusts: Any) -> tupl
     below = tree.backward_pass(forces, ((), (ZERO, ZERO)), moved, *state.submerged[1:])[2]
     whole = forces(tree.root, None, (root, None), *state.submerged[:1])[2]
     own = jax.tree.map(lambda x: x[0], whole)
-    bed, wet = jax.tree.map(add, own, below)
-    return bed, wet
+    return jax.tree.map(add, own, below)
 
 
 def contact_force(

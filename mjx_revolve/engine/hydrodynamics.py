@@ -137,21 +137,12 @@ def _some(vector: Any) -> Any:
 
 def _to_body(motion: BodyMotion, vector: Any) -> Any:
     """A vector of the world seen from each body's frame."""
-    if vector is None:
-        return None
-    axes = (motion.x_axis, motion.y_axis, motion.z_axis)
-    return tuple(
-        total(*[mul(c, axis[i]) for c, axis in zip(vector, axes, strict=True)]) for i in range(3)
-    )
+    return None if vector is None else matTvec(motion.axes, vector)
 
 
 def _world_position(motion: BodyMotion, position: Vec) -> Vec:
     """World coordinates of points in the bodies' frames."""
-    return (
-        add(motion.xy[0], dot(motion.x_axis, position)),
-        add(motion.xy[1], dot(motion.y_axis, position)),
-        add(motion.height, dot(motion.z_axis, position)),
-    )
+    return vadd(motion.position, matvec(motion.axes, position))
 
 
 def _stream(world: World, water: Water, motion: BodyMotion, position: Vec) -> _Stream:

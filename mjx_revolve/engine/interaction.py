@@ -93,7 +93,7 @@ def frames_of(trees: BatchedTrees, state: State) -> Frames:
         motion = body_motions(trees, state)
         axes = motion.axes
         velocity, angular = matvec(axes, motion.velocity), matvec(axes, motion.angular_velocity)
-        return Frames(axes, (*motion.xy, motion.height), velocity, angular)
+        return Frames(axes, motion.position, velocity, angular)
 
     return fuse(find)(state._replace(qacc_prev=(), command=(), submerged=()))
 

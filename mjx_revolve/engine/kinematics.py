@@ -14,6 +14,7 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.single_tree import make_single_tree
 from mjx_revolve.engine.state import State
 from mjx_revolve.engine.tree import Tree
+from mjx_revolve.numerics.articulated import to_child
 from mjx_revolve.numerics.inertia import BodyMotion
 from mjx_revolve.numerics.spatial import (
     UNIT,
@@ -22,7 +23,6 @@ from mjx_revolve.numerics.spatial import (
     Scalar,
     Vec,
     add,
-    cross,
     dot,
     matmul,
     matTvec,
@@ -33,6 +33,8 @@ from mjx_revolve.numerics.spatial import (
     sincos,
     sub,
     vadd,
+    vscale,
+    vsub,
 )
 
 
@@ -79,10 +81,7 @@ def forward_kinematics(
         x_axis, y_axis, xy = None, None, None
         if located:
             x_axis, y_axis = matTvec(rotation, parent.x_axis), matTvec(rotation, parent.y_axis)
-            xy = (
-                add(parent.xy[0], dot(parent.x_axis, position)),
-                add(parent.xy[1], dot(parent.y_axis, position)),
-            )
+            xy = vadd(parent.xy, matvec((parent.x_axis, parent.y_axis), position))
         height = add(parent.height, dot(parent.z_axis, position))
         midpoint = parent.midpoint and _child_velocity(rotation, position, parent.midpoint, ahead)
         z_axis = matTvec(rotation, parent.z_axis)
@@ -91,8 +90,7 @@ def forward_kinematics(
         )
         return motion, (motion, rotation)
 
-    below = tree.forward_pass(move, root, state.angle, state.speed, midpoint_speed)
-    return root, below
+    return root, tree.forward_pass(move, root, state.angle, state.speed, midpoint_speed)
 
 
 def _row(xs: Any) -> Any:
@@ -120,10 +118,8 @@ def _child_velocity(
     rotation: Mat, position: Vec, velocity: tuple[Vec, Vec], speed: Scalar
 ) -> tuple[Vec, Vec]:
     """Angular and linear velocity of a child from those of its parent."""
-    angular, linear = velocity
-    own = matTvec(rotation, angular)
-    linear = matTvec(rotation, vadd(linear, cross(angular, position)))
-    return (own[0], own[1], add(own[2], speed)), linear
+    (x, y, z), linear = to_child(rotation, position, velocity)
+    return (x, y, add(z, speed)), linear
 
 
 class BodyFrames(NamedTuple):
@@ -181,12 +177,7 @@ def body_motions(tree: Tree, state: State) -> BodyMotion:
         `[1 + nhinge, lanes]` each, in the order of `Tree.join_rows`; velocities over ground. Each
         body's frame lies at its hinge and has the hinge's axis for its z (see `level`).
     """
-    root, below = forward_kinematics(tree, state, True)
-    return stack_motions(tree, root, below, state.position[0])
-
-
-def stack_motions(tree: Tree, root: BodyMotion, below: Any, like: jax.Array) -> BodyMotion:
-    """The motions of `forward_kinematics` as one, `[1 + nhinge, lanes]` each."""
+    (root, below), like = forward_kinematics(tree, state, True), state.position[0]
     root = jax.tree.map(lambda x: jnp.broadcast_to(x, (1, *like.shape)), root)
     rows = tree.stack_saved(below, lambda saved: saved[0], like)
     return root if rows is None else jax.tree.map(lambda *x: jnp.concatenate(x), root, rows)
@@ -209,11 +200,8 @@ def center_of_mass(tree: Tree, state: State) -> Vec:
         motion = moved[0]
         wide = lambda x: add(x, jnp.zeros_like(motion.height))  # noqa: E731
         # From the core: far from the origin, products with a mass would lose digits.
-        place = (*motion.xy, motion.height)
-        moment = tuple(
-            wide(add(mul(level.mass, sub(x, origin)), dot(axis, level.moment)))
-            for x, origin, axis in zip(place, core, motion.axes, strict=True)
-        )
+        away = vscale(level.mass, vsub(motion.position, core))
+        moment = tuple(map(wide, vadd(away, matvec(motion.axes, level.moment))))
         return (), (), (wide(level.mass), moment)
 
     _, _, (mass, moment) = tree.backward_pass(weigh, ((), (0.0, ZERO)), below)
@@ -249,7 +237,7 @@ def body_poses(
     for motion, bodies, frames in zip(motions, tree.bodies, tree.frames, strict=True):
         count = len(bodies)
         wide = lambda x, n=count: xp.broadcast_to(x, (n, lanes))  # noqa: E731
-        positions = xp.stack([wide(x) for x in (*motion.xy, motion.height)], -1)
+        positions = xp.stack([wide(x) for x in motion.position], -1)
         axes = xp.stack([xp.stack([wide(x) for x in axis], -1) for axis in motion.axes], -2)
         for k, (body, frame) in enumerate(zip(bodies, frames, strict=True)):
             # From the hinge's frame to MuJoCo's.
@@ -259,7 +247,7 @@ def body_poses(
 
 def mass_centers(robot: Robot, qpos: Float[np.ndarray, "n nq"]) -> Float[np.ndarray, "n 3"]:
     """`center_of_mass` of one robot in many configurations, by NumPy, world frame [m]."""
-    poses: Any = body_poses(robot, qpos)  # type: ignore[arg-type]  # of NumPy's arrays
-    (place, turn), mass = poses, robot.assembly.mass
+    place, turn = body_poses(robot, qpos)  # type: ignore[arg-type]  # of NumPy's arrays
+    mass = robot.assembly.mass
     centers = place + np.einsum("nbij,bj->nbi", turn, robot.assembly.center)
     return np.einsum("b,nbi->ni", mass, centers) / mass.sum()

@@ -18,9 +18,11 @@ from mjx_revolve.numerics.spatial import (
     Vec,
     add,
     cross,
+    dot,
     full,
     madd,
     matmul,
+    matTvec,
     matvec,
     mul,
     neg,
@@ -124,6 +126,21 @@ def eliminate_joint(
         vadd(vadd(bias[1], carried[1]), vscale(pushed, column_l)),
     )
     return left, bias, JointElimination(row_a, row_l, inverse, rest)
+
+
+def to_child(turn: Mat, position: Vec, motion: tuple[Vec, Vec]) -> tuple[Vec, Vec]:
+    """A motion (angular, linear) of a parent, seen from the child's frame and origin."""
+    angular, linear = motion
+    return matTvec(turn, angular), matTvec(turn, vadd(linear, cross(angular, position)))
+
+
+def release_joint(
+    joint: JointElimination, axis: tuple[Vec, Vec], held: tuple[Vec, Vec]
+) -> tuple[tuple[Vec, Vec], Scalar]:
+    """Accelerations of a body and of its hinge; `held`: the body's if the hinge did not move."""
+    rest = sub(sub(joint.rest, dot(joint.row_a, held[0])), dot(joint.row_l, held[1]))
+    hinge = mul(joint.inverse, rest)
+    return (vadd(held[0], vscale(hinge, axis[0])), vadd(held[1], vscale(hinge, axis[1]))), hinge
 
 
 def solve_root(block: Block, bias: tuple[Vec, Vec], symmetric: bool) -> tuple[Vec, Vec]:

@@ -67,6 +67,11 @@ class BodyMotion(NamedTuple):
         return self.midpoint or (self.angular_velocity, self.velocity)
 
     @property
+    def position(self) -> Vec:
+        """World coordinates of the bodies' origins; only where `xy` is known."""
+        return (*self.xy, self.height)
+
+    @property
     def axes(self) -> tuple[Vec, Vec, Vec]:
         """The world's three axes, body frame: the rows of the rotation world from body."""
         return self.x_axis, self.y_axis, self.z_axis
