@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import jax
 import mujoco
@@ -45,21 +46,23 @@ def check_edit(model: mujoco.MjModel, built: mujoco.MjModel, name: str) -> None:
         InputError: it differs in more than masses, inertias, hinges and servos, or a number of
             these is none that a robot can have.
     """
+    thrust = built.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE
+    at = built.actuator_trnid[thrust, 0]
+
+    def fixed(m: mujoco.MjModel) -> dict[str, Any]:
+        """Numbers that an edit must leave as they are."""
+        found = {x: getattr(m, x) for x in _FIXED if hasattr(m, x)}
+        found |= {f"opt.{x}": getattr(m.opt, x) for x in ("timestep", "gravity", "disableflags")}
+        found |= {f"{x} of the core": getattr(m, x)[:6] for x in ("dof_armature", "dof_damping")}
+        found["actuator_biasprm"] = m.actuator_biasprm[:, 0]
+        found["actuator_gainprm"] = m.actuator_gainprm[:, 1:]
+        push = {f"actuator_{x}": thrust for x in _THRUST} | {f"site_{x}": at for x in _SITE}
+        return found | {f"{x} of a thruster": getattr(m, x)[rows] for x, rows in push.items()}
+
     changed = [x for x in _COUNTS if getattr(model, x) != getattr(built, x)]
     if not changed:
-        pairs = [(x, getattr(model, x), getattr(built, x)) for x in _FIXED if hasattr(built, x)]
-        pairs += [(f"opt.{x}", *(getattr(m.opt, x) for m in (model, built)))
-                  for x in ("timestep", "gravity", "disableflags")]  # fmt: skip
-        pairs += [(f"{x} of the core", getattr(model, x)[:6], getattr(built, x)[:6])
-                  for x in ("dof_armature", "dof_damping")]  # fmt: skip
-        pairs += [(x, getattr(model, x)[:, part], getattr(built, x)[:, part]) for x, part in
-                  (("actuator_biasprm", 0), ("actuator_gainprm", slice(1, None)))]  # fmt: skip
-        thrust = built.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE
-        at = built.actuator_trnid[thrust, 0]
-        parts = [(f"actuator_{x}", thrust) for x in _THRUST] + [(f"site_{x}", at) for x in _SITE]
-        pairs += [(f"{x} of a thruster", *(getattr(m, x)[part] for m in (model, built)))
-                  for x, part in parts]  # fmt: skip
-        changed = [x for x, new, old in pairs if not np.allclose(new, old, atol=1e-9)]
+        pairs = zip(fixed(model).items(), fixed(built).values(), strict=True)
+        changed = [x for (x, new), old in pairs if not np.allclose(new, old, atol=1e-9)]
     if changed:
         expected = "other masses, inertias, hinges or servos only"
         found = f"another {', '.join(changed)} (edit the morphology or the world instead)"
