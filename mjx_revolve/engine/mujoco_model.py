@@ -13,7 +13,6 @@ import mujoco
 import numpy as np
 
 from mjx_revolve.body.module_types import Part
-from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.body.placement import Module
 from mjx_revolve.engine.assembly import BALLAST_RADIUS, Assembly
 from mjx_revolve.engine.fluid_table import drag_law
@@ -62,7 +61,7 @@ def compile_model(assembly: Assembly) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     spec.option.density = 0.0
     spec.option.viscosity = 0.0
     try:
-        _add_bed(spec, morphology, world)
+        _add_bed(spec, assembly)
         _add_bodies(spec, assembly)
         _add_pairs(spec, assembly)
         return spec, spec.compile()
@@ -74,9 +73,9 @@ def compile_model(assembly: Assembly) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
         ) from None
 
 
-def _add_bed(spec: mujoco.MjSpec, morphology: Morphology, world: World) -> None:
+def _add_bed(spec: mujoco.MjSpec, assembly: Assembly) -> None:
     """The ground as a geom: to be seen, and with `contact: mjx` to be met by MuJoCo's solver."""
-    bed = world.bed
+    bed = assembly.world.bed
     if bed is None:
         return
     half, points = bed.extent / 2, 201
@@ -92,7 +91,7 @@ def _add_bed(spec: mujoco.MjSpec, morphology: Morphology, world: World) -> None:
         if rough:  # a round cone: the default pyramid loses 30 % of the friction across its edges
             spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         # MJX's cost grows with the square of it; the deepest contacts are those that are kept.
-        most = max(_LEAST_CONTACTS, _flush_corners(morphology))
+        most = max(_LEAST_CONTACTS, _flush_corners(assembly))
         spec.add_numeric(name="max_contact_points", data=[most], size=1)
         points = int(np.clip(bed.extent / _GRID + 1, points, _MOST_POINTS))
     if bed.kind == "flat":
@@ -117,18 +116,15 @@ def _add_bed(spec: mujoco.MjSpec, morphology: Morphology, world: World) -> None:
     )
 
 
-def _flush_corners(morphology: Morphology) -> int:
+def _flush_corners(assembly: Assembly) -> int:
     """Most corners that touch a plane on which the robot lies, as it is at rest."""
-    corners = []
-    for module in morphology.modules:
-        for part in (part for part in module.kind.parts if part.contact):
-            for box in part.boxes:
-                signs = np.array(list(np.ndindex(2, 2, 2))) - 0.5
-                place = np.asarray(part.position) + box.position + signs * box.size
-                corners.append(module.position + place @ module.rotation.T)
-    if not corners:
+    layout = assembly.layout
+    boxes = np.flatnonzero(assembly.touching[layout.box_part])
+    if not len(boxes):
         return 0
-    place = np.concatenate(corners)
+    signs, turn = 2 * np.array(list(np.ndindex(2, 2, 2))) - 1, layout.rotation[layout.box_part]
+    corners = signs * layout.box_half[:, None] @ turn.swapaxes(1, 2)
+    place = (layout.box_centers()[:, None] + corners)[boxes].reshape(-1, 3)
     high, low = place > place.max(0) - _FLUSH, place < place.min(0) + _FLUSH
     return int(max(high.sum(0).max(), low.sum(0).max()))
 
