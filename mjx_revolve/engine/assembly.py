@@ -305,7 +305,7 @@ def _weigh(
     square = np.array([part.boxes[0].size for part in parts]) ** 2
     around = box[:, None] / 12 * (square.sum(1, keepdims=True) - square)
     around += 2 / 5 * BALLAST_RADIUS**2 * ballast[:, None]
-    inertias = _diagonal(around) + _steiner(box, own) + _steiner(ballast, at - own)
+    inertias = around[:, None] * np.eye(3) + _steiner(box, own) + _steiner(ballast, at - own)
 
     def total(x: np.ndarray) -> np.ndarray:
         columns = x.reshape(len(x), -1).T
@@ -318,11 +318,6 @@ def _weigh(
     center = total(weight[:, None] * middle) / np.where(mass == 0, 1.0, mass)[:, None]
     inertia = turn @ inertias[kind] @ turn.swapaxes(1, 2)
     return mass, center, total(inertia + _steiner(weight, middle - center[carrier]))
-
-
-def _diagonal(x: np.ndarray) -> np.ndarray:
-    """`[n, 3]` to `[n, 3, 3]`."""
-    return x[:, None] * np.eye(3)
 
 
 def _steiner(mass: np.ndarray, arm: np.ndarray) -> np.ndarray:

@@ -531,17 +531,11 @@ def _is_square(kinds: Sequence[ModuleType]) -> bool:
 
     Hinges turn about an axis of theirs, which may then be turned by any multiple of 90°.
     """
-
-    def along_axis(vector: Sequence[float]) -> bool:
-        return bool(np.count_nonzero(np.abs(vector) > 1e-12) == 1)
-
-    for kind in kinds:
-        vectors = [v for slot in kind.slots.values() for v in (slot.direction, slot.up)]
-        vectors += [kind.mount.outward] if kind.mount is not None else []
-        vectors += [kind.hinge.axis] if kind.hinge is not None else []
-        if not all(map(along_axis, vectors)):
-            return False
-    return True
+    slots = [slot for kind in kinds for slot in kind.slots.values()]
+    vectors = [v for slot in slots for v in (slot.direction, slot.up)]
+    vectors += [kind.mount.outward for kind in kinds if kind.mount is not None]
+    vectors += [kind.hinge.axis for kind in kinds if kind.hinge is not None]
+    return all(np.count_nonzero(np.abs(vector) > 1e-12) == 1 for vector in vectors)
 
 
 # ------------------------------------------------------------------ packing

@@ -304,12 +304,9 @@ class BatchedTrees:
         dtype = self.table.data.dtype
         wide = [jnp.broadcast_to(jnp.asarray(x, dtype), (1, self.lanes))[0] for x in leaves]
         # Without copies, XLA computes these number by number, behind a branch.
-        joined = (
-            materialize(jnp.concatenate([materialize(x) for x in wide]))
-            if wide
-            else jnp.zeros(0, dtype)
-        )
-        return PackedRow(joined, tree)
+        if not wide:
+            return PackedRow(jnp.zeros(0, dtype), tree)
+        return PackedRow(materialize(jnp.concatenate(list(map(materialize, wide)))), tree)
 
     def _part(self, joined: PackedRow) -> Any:
         rows = joined.data.reshape(-1, self.lanes)
@@ -319,13 +316,10 @@ class BatchedTrees:
         """The values of a row of each of `xs`."""
 
         def pick(x: Any) -> Any:
-            return (
-                self._part(replace(x, data=_at(x.data, k)))
-                if isinstance(x, PackedRow)
-                else _at(x, k)
-            )
+            return self._part(replace(x, data=_at(x.data, k))) if packed(x) else _at(x, k)
 
-        return jax.tree.map(pick, xs, is_leaf=lambda x: isinstance(x, PackedRow))
+        packed = lambda x: isinstance(x, PackedRow)  # noqa: E731
+        return jax.tree.map(pick, xs, is_leaf=packed)
 
     # The stack of values for children or for a parent: rows of it, or a list of `[n, lanes]`.
 
@@ -374,15 +368,13 @@ class PackedConstants(NamedTuple):
     def of(level: Level) -> PackedConstants:
         """The table of `[rows, ...]` constants."""
         leaves, tree = jax.tree.flatten(level)
-        arrays = [isinstance(x, jax.Array) for x in leaves]
-        pairs = list(zip(leaves, arrays, strict=True))
-        wide = [a and jnp.issubdtype(x.dtype, jnp.floating) for x, a in pairs]
-        chosen = [x.reshape(x.shape[0], -1) for x, w in zip(leaves, wide, strict=True) if w]
+        arrays = [x for x in leaves if isinstance(x, jax.Array)]
+        wide = lambda x: isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)  # noqa: E731
         return PackedConstants(
-            jnp.concatenate(chosen, 1),
-            [x for (x, a), w in zip(pairs, wide, strict=True) if a and not w],
-            [x.shape[1:] if w else None for x, w in zip(leaves, wide, strict=True)],
-            [None if a else x for x, a in pairs],
+            jnp.concatenate([x.reshape(x.shape[0], -1) for x in arrays if wide(x)], 1),
+            [x for x in arrays if not wide(x)],
+            [x.shape[1:] if wide(x) else None for x in leaves],
+            [None if isinstance(x, jax.Array) else x for x in leaves],
             tree,
         )
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -114,10 +115,8 @@ def energy_balance(
     ctrl = np.asarray(ctrl)[1:, actuators_of(robot)]
     water = jax.tree.map(lambda x: jnp.asarray(x)[1:] if jnp.ndim(x) else x, water)
 
-    def run(*given: Any) -> dict[str, jax.Array]:
-        return fuse(lambda *rows: _powers(tree, *rows), inline=True)(*given)
-
     rows = (jnp.asarray(np.asarray(x).T) for x in (qpos, qvel, command, ctrl))
+    run = fuse(partial(_powers, tree), inline=True)
     found = jit(run, fast=True)(*rows, water, variation)
     found = {name: np.asarray(x, float) for name, x in found.items()}
     kinetic = float(found.pop("kinetic_after")[-1] - found.pop("kinetic_before")[0])

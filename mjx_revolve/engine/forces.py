@@ -232,5 +232,4 @@ def part_forces(
                 stacked = jnp.stack(turned, -1)
                 for slot, body in zip(*np.nonzero(rows >= 0), strict=True):
                     found[k] = found[k].at[:, rows[slot, body]].set(stacked[slot, body])
-    buoyancy, drag, thrust = found
-    return buoyancy, drag, thrust
+    return found[0], found[1], found[2]
