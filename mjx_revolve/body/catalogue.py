@@ -268,8 +268,7 @@ MODULES: dict[str, ModuleType] = _with_aliases(
 # sensor the brick's box; that is not taken over, as the thesis does not say how it is attached.
 THESIS_MODULES: dict[str, ModuleType] = MODULES | _with_aliases(
     replace(
-        _HINGE,
-        parts=(replace(_HINGE.parts[0], mass=0.009), replace(_HINGE.parts[1], mass=0.0017)),
+        _HINGE, parts=(replace(_HINGE.parts[0], mass=0.009), replace(_HINGE.parts[1], mass=0.0017))
     )
 )
 """The catalogue with the hinge masses of the thesis's Table 1."""

@@ -52,9 +52,7 @@ _ORIGIN = frozen(np.zeros(3)), frozen(np.eye(3))
 
 
 def load_morphology(
-    path: str | Path,
-    modules: Mapping[str, ModuleType] = MODULES,
-    allow_overlap: bool = False,
+    path: str | Path, modules: Mapping[str, ModuleType] = MODULES, allow_overlap: bool = False
 ) -> Morphology:
     """Reads a robot's body from Revolve's YAML, as `make_morphology` does from a mapping.
 

@@ -356,10 +356,7 @@ _UNBOUNDED = 1e9
 
 
 def _read_bounds(
-    assembly: Assembly,
-    frame: np.ndarray,
-    laws: Mapping[str, DragLaw],
-    numbers: Mapping[str, Any],
+    assembly: Assembly, frame: np.ndarray, laws: Mapping[str, DragLaw], numbers: Mapping[str, Any]
 ) -> DragBound:
     """Bounds of the gradient of each body's drag: each part's is g ρ A v, with the largest face A.
 

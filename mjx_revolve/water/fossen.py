@@ -88,8 +88,7 @@ FOSSEN = PartDragLaw(
     numbers=_numbers,
     force=_force,
     mjcf=Export(
-        "inertia_box",
-        missing="stated damping (fossen), replaced by that of MuJoCo's inertia box",
+        "inertia_box", missing="stated damping (fossen), replaced by that of MuJoCo's inertia box"
     ),
     sdf=Export("fossen", note="Hydrodynamics damps modules that state it with their own numbers"),
 )
