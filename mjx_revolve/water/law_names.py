@@ -62,21 +62,21 @@ def _law(describe: Callable[[], str]) -> BeforeValidator:
     return BeforeValidator(check)
 
 
-def _maps(value: Any) -> bool:
-    """Whether a value is a mapping, or the pairs that one was read into."""
-    if isinstance(value, tuple):
-        return all(isinstance(x, tuple) and len(x) == 2 for x in value)
-    return isinstance(value, Mapping)
+def _read_mapping(value: Any, what: str) -> dict[Any, Any]:
+    """A mapping from coefficients, from itself or the pairs that it was read into; empty: none."""
+    if value is None or value in ((), []):
+        return {}
+    pairs = isinstance(value, tuple) and all(isinstance(x, tuple) and len(x) == 2 for x in value)
+    if not (pairs or isinstance(value, Mapping)):
+        raise ConstraintError("", f"a mapping from coefficients to {what}", show(value))
+    return dict(value)
 
 
 @also({"type": "object", "additionalProperties": {"type": "number"}}, {"type": "null"})
 def _read_coefficients(value: Any) -> Any:
     """A mapping from names to numbers as sorted pairs, each within its coefficient's bounds."""
-    if value is None or value in ((), []):
-        return ()
-    if not _maps(value):
-        raise ConstraintError("", "a mapping from coefficients to numbers", show(value))
-    given, known = dict(value), {c.name: c for _, c in list_coefficients() if not c.own_field}
+    given = _read_mapping(value, "numbers")  # without any, no law is imported
+    known = {c.name: c for _, c in list_coefficients() if not c.own_field} if given else {}
     for name, number in given.items():
         if name not in known:
             names = f"({', '.join(known) or 'there is none without a field of its own'})"
@@ -133,11 +133,8 @@ def factor_names() -> dict[str, tuple[bool, float]]:
 
 def _read_factors(value: Any) -> Any:
     """A mapping from names to factors as sorted pairs."""
-    if value is None or value in ((), []):
-        return ()
-    if not _maps(value):
-        raise ConstraintError("", "a mapping from coefficients to factors", show(value))
-    given, known = {**dict(value)}, factor_names()
+    given = _read_mapping(value, "factors")
+    known = factor_names() if given else {}
     for name, factor in given.items():
         if name not in known:
             raise ConstraintError("", f"names of coefficients ({', '.join(known)})", show(name))
