@@ -290,21 +290,17 @@ def load_current_field(path: str | Path) -> CurrentField:
 
 
 def _read_arrays(path: Path) -> CurrentField:
+    if not zipfile.is_zipfile(path):
+        raise InputError("expected an NPZ archive; found something else")
     try:
-        with path.open("rb") as file:
-            if not zipfile.is_zipfile(file):
-                raise InputError("expected an NPZ archive; found something else")
-            file.seek(0)
-            with np.load(file, allow_pickle=False) as data:
-                for name in _ARRAYS:
-                    if name not in data:
-                        raise InputError(f"expected arrays {', '.join(_ARRAYS)}; found no {name}")
-                x, y, z, velocity = (data[name] for name in _ARRAYS)
-                return CurrentField(x, y, z, velocity, str(path))
-    except InputError:
-        raise
+        with np.load(path, allow_pickle=False) as data:
+            found = {name: data[name] for name in _ARRAYS if name in data}
     except (ValueError, EOFError, zlib.error, zipfile.BadZipFile, NotImplementedError) as error:
         raise InputError(f"expected arrays of numbers; found: {error}") from None
+    for name in _ARRAYS:
+        if name not in found:
+            raise InputError(f"expected arrays {', '.join(_ARRAYS)}; found no {name}")
+    return CurrentField(**found, path=str(path))
 
 
 def _read_table(path: Path) -> CurrentField:

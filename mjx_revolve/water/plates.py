@@ -87,15 +87,13 @@ _SIX = "six numbers, or six rows of six"
 def _read_matrix(value: Any) -> Any:
     """Six numbers on the diagonal, or six rows of six, as six rows."""
     rows = as_tuple(value)
-    if isinstance(rows, tuple):
-        rows = tuple(map(as_tuple, rows))
-        if len(rows) == 6 and not any(isinstance(row, tuple) for row in rows):
-            rows = tuple((0,) * i + (x,) + (0,) * (5 - i) for i, x in enumerate(rows))
-    numbers = [x for row in rows if isinstance(row, tuple) for x in row] if rows else []
+    rows = tuple(map(as_tuple, rows)) if isinstance(rows, tuple) else ()
+    if len(rows) == 6 and not any(isinstance(row, tuple) for row in rows):
+        rows = tuple((0,) * i + (x,) + (0,) * (5 - i) for i, x in enumerate(rows))
+    square = [isinstance(row, tuple) and len(row) == 6 for row in rows] == [True] * 6
+    numbers = [x for row in rows for x in row] if square else [math.nan]
     plain = all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers)
-    if not isinstance(rows, tuple) or len(rows) != 6 or len(numbers) != 36 or not plain:
-        raise ConstraintError("", _SIX, show(value))
-    if any(len(row) != 6 for row in rows) or not all(abs(x) <= LARGEST for x in numbers):
+    if not plain or not all(abs(x) <= LARGEST for x in numbers):
         raise ConstraintError("", _SIX, show(value))
     matrix = np.array(rows, float)
     size = np.abs(matrix).max()
