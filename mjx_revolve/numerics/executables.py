@@ -48,21 +48,18 @@ class StoredProgram:
 
     def __call__(self, *args: PyTree) -> PyTree:
         """Calls it."""
-        folder = runtime.program_folder()
-        if self._made_of[0] is None or folder is None or not on_cpu():
-            return self._jitted(*args)
-        args = jax.tree.map(jax.numpy.asarray, args)
-        return self._load(folder, args)(*args)
+        return self._jitted(*args) if self._folder is None else self.load(*args)(*args)
+
+    @property
+    def _folder(self) -> Path | None:
+        """Where its executables are kept; None: nowhere."""
+        return runtime.program_folder() if self._made_of[0] is not None and on_cpu() else None
 
     def load(self, *args: PyTree) -> Callable[..., PyTree]:
         """What calls it with such arguments, compiled if need be, but not called yet."""
-        folder = runtime.program_folder()
         args = jax.tree.map(jax.numpy.asarray, args)
-        if self._made_of[0] is None or folder is None or not on_cpu():
+        if (folder := self._folder) is None:
             return self._jitted.lower(*args).compile()
-        return self._load(folder, args)
-
-    def _load(self, folder: Path, args: tuple[PyTree, ...]) -> Callable[..., PyTree]:
         leaves, tree = jax.tree.flatten((args, {}))
         shapes = tuple((x.shape, str(x.dtype), getattr(x, "weak_type", False)) for x in leaves)
         key = tree, shapes, _modes()
