@@ -650,12 +650,13 @@ def water_forces(
     on_bodies = _body_drag(world, level, motion, water, fractions)
     if on_bodies is not None:
         torque, force = vadd(torque, on_bodies[0]), vadd(force, on_bodies[1])
+    found = ExternalForces(torque, force, carried, None, damping, tuple(submerged))
     if carried is None:
-        return ExternalForces(torque, force, None, None, damping, tuple(submerged))
+        return found
     angular, velocity = motion.midpoint_velocity
     stream = _stream(world, water, motion, ZERO)
     if stream.velocity is None:
-        return ExternalForces(torque, force, carried, None, damping, tuple(submerged))
+        return found
     momentum = apply_inertia(carried, ZERO, tuple(map(neg, stream.velocity)))
     # The step turns the momentum with the body's velocity, not with the relative one.
     linear = apply_inertia(carried, angular, vsub(velocity, stream.velocity))[1]
@@ -664,5 +665,6 @@ def water_forces(
     if stream.acceleration is not None:
         change = vsub(change, stream.acceleration)
     turning = apply_inertia(carried, ZERO, change)
-    torque, force = vsub(torque, turning[0]), vsub(force, turning[1])
-    return ExternalForces(torque, force, carried, momentum, damping, tuple(submerged))
+    return found._replace(
+        torque=vsub(torque, turning[0]), force=vsub(force, turning[1]), momentum=momentum
+    )
