@@ -230,37 +230,34 @@ def assemble(morphologies: Sequence[Morphology], world: World) -> Assembly:
     below: list[int] = []  # the moving body that each module is fixed to
     above: list[int] = []  # the one that carries its children
     parent, named, robot, roots = [0], [-1], [-1], []
-    for r, body in enumerate(morphologies):
+    for r, morphology in enumerate(morphologies):
         first = len(above)
         roots.append(len(parent))
-        for k, module in enumerate(body.modules, first):
-            if module.parent < 0 or module.kind.hinge is not None:
-                below.append(0 if module.parent < 0 else above[first + module.parent])
-                above.append(len(parent))
-                parent.append(below[-1])
+        for k, module in enumerate(morphology.modules, first):
+            carrier = 0 if module.parent < 0 else above[first + module.parent]
+            moves = module.parent < 0 or module.kind.hinge is not None
+            above.append(len(parent) if moves else carrier)
+            below.append(above[-1] if module.parent < 0 else carrier)
+            if moves:
+                parent.append(carrier)
                 named.append(k)
                 robot.append(r)
-                if module.parent < 0:
-                    below[-1] = above[-1]
-            else:
-                below.append(above[first + module.parent])
-                above.append(below[-1])
     end = list(range(1, len(parent) + 1))
     for k in reversed(range(1, len(parent))):
         end[parent[k]] = max(end[parent[k]], end[k])
     layout = rest_pose(*(body.modules for body in morphologies))
     # Of a module with a hinge, the first part stays with what it is attached to.
     stays = np.append(True, np.diff(layout.module) > 0)
-    carrier = np.where(stays, np.array(below)[layout.module], np.array(above)[layout.module])
+    body = np.where(stays, np.array(below)[layout.module], np.array(above)[layout.module])
     hinges = [modules[k].kind.hinge if p else None for k, p in zip(named, parent, strict=True)]
     anchor = np.array([(0.0, 0.0, 0.0) if h is None else h.anchor for h in hinges])
     rotation = np.array([np.eye(3), *(modules[k].rotation for k in named[1:])])
     position = np.array([np.zeros(3), *(modules[k].position for k in named[1:])])
     position += turned(rotation, anchor)
-    back = rotation[carrier].swapaxes(1, 2)
-    place = turned(back, layout.position - position[carrier])
+    back = rotation[body].swapaxes(1, 2)
+    place = turned(back, layout.position - position[body])
     turn = back @ layout.rotation
-    mass, center, inertia = _weigh(layout, carrier, place, turn, len(parent))
+    mass, center, inertia = _weigh(layout, body, place, turn, len(parent))
     effort = np.array([1.0 if h is None else h.effort for h in hinges])
     speed = np.array([1.0 if h is None else h.speed for h in hinges])
     axis = np.array([(0.0, 0.0, 1.0) if h is None else h.axis for h in hinges])
@@ -288,7 +285,7 @@ def assemble(morphologies: Sequence[Morphology], world: World) -> Assembly:
         damping=damping,
         stiffness=stiffness,
         implicit_stiffness=np.zeros(len(parent)),
-        fluid=make_fluid_table(layout, carrier, place, turn, world),
+        fluid=make_fluid_table(layout, body, place, turn, world),
         thruster_row=np.flatnonzero(pushing),
     ).with_split_springs()
 
