@@ -274,39 +274,34 @@ class Graph:
         def run(*args: PyTree) -> PyTree:
             values: dict[int, Any] = {}
             leaves, tree = jax.tree.flatten(args)
-            for number, (operations, inputs) in enumerate(cuts):
-                last = number == count - 1
+
+            def arguments(*leaves: Any) -> list[Any]:
+                return jax.tree.leaves(unpack(*jax.tree.unflatten(tree, leaves)))
+
+            def run_piece(number: int) -> PyTree:
+                (operations, inputs), last = cuts[number], number == count - 1
                 outputs = [v for v in own[number] if v in read]
                 wanted = {v for op in operations for v in op.inputs if isinstance(v, int)}
                 wanted |= set(ends if last else ())
-                used = _used_inputs(
-                    lambda *leaves: jax.tree.leaves(unpack(*jax.tree.unflatten(tree, leaves))),
-                    leaves,
-                    [v in wanted for v in self._arguments],
-                )
+                used = _used_inputs(arguments, leaves, [v in wanted for v in self._arguments])
 
-                def compute(
-                    given: PyTree, *xs: Any, cut: Any = (operations, inputs, outputs, last, used)
-                ) -> Any:
-                    operations, inputs, outputs, last, used = cut
+                def compute(given: PyTree, *xs: Any) -> Any:
                     local = self._constants | dict(zip(inputs, xs, strict=True))
                     some = iter(given)
                     whole = [
                         next(some) if u else np.zeros(x.shape, x.dtype)
                         for x, u in zip(leaves, used, strict=True)
                     ]
-                    whole = jax.tree.leaves(unpack(*jax.tree.unflatten(tree, whole)))
-                    local |= zip(self._arguments, whole, strict=True)
+                    local |= zip(self._arguments, arguments(*whole), strict=True)
                     self._compute(operations, local)
-                    if last:
-                        return pack(self._finish(local))
-                    return [local[v] for v in outputs]
+                    return pack(self._finish(local)) if last else [local[v] for v in outputs]
 
                 given = [x for x, u in zip(leaves, used, strict=True) if u]
                 found = fuse_call(compute)(given, *(values[v] for v in inputs))
-                if last:
-                    return found
-                values.update(zip(outputs, found, strict=True))
+                values.update(() if last else zip(outputs, found, strict=True))
+                return found
+
+            return [run_piece(number) for number in range(count)][-1]
 
         return run
 
