@@ -36,7 +36,7 @@ from mjx_revolve.numerics.boxes import (
     BoxPair,
     box_contact,
     dot,
-    last_of,
+    first_largest,
     matmul,
     matvec,
     weight,
@@ -693,11 +693,8 @@ class _Contacts(NamedTuple):
         def join(now: Any) -> Any:
             """One contact more of each robot that misses any."""
             force, columns, moved, missing, wanting = now
-            worst, better = missing[0], []
-            for k in range(1, _MOST):
-                better.append(weight(missing[k] > worst, worst))
-                worst = jnp.maximum(worst, missing[k])
-            chosen = jnp.stack(last_of(better)) * wanting
+            worst, _ = first_largest([missing[k] for k in range(_MOST)])
+            chosen = jnp.stack(worst) * wanting
             torque = [_sum([chosen[k] * x[k] for k in range(_MOST)]) for x in levers]
             change = respond(jnp.stack(torque))
             own = _sum([change[6 + k] * x for k, x in enumerate(levers)]) + _SOFTNESS * chosen

@@ -244,15 +244,21 @@ def _largest_of(groups: Sequence[Scalar]) -> list[Scalar]:
     Numbers are compared with each other, never with their maximum: XLA may compute it with other
     last bits than the numbers themselves, and then no axis would be it.
     """
-    best, better = groups[0], []
-    xp = namespace(best)
-    for x in groups[1:]:
-        better.append(weight(x > best, x))
-        best = xp.maximum(best, x)
+    xp = namespace(groups[0])
+    share, best = first_largest(groups)
     second = weight(best[1] > best[0], best)
     third = weight(best[2] > xp.maximum(best[0], best[1]), best)
     row = _stacked(last_of([second, third]))
-    return [x * row for x in last_of(better)]
+    return [x * row for x in share]
+
+
+def first_largest(xs: Sequence[Scalar]) -> tuple[list[Scalar], Scalar]:
+    """1 for the first of the largest of some things, 0 for the others; and the largest."""
+    best, better = xs[0], []
+    for x in xs[1:]:
+        better.append(weight(x > best, x))
+        best = namespace(best).maximum(best, x)
+    return last_of(better), best
 
 
 def last_of(better: Sequence[Scalar]) -> list[Scalar]:
