@@ -407,7 +407,8 @@ def make_batched_trees(
         The trees.
     """
     bodies = jax.tree.map(jnp.asarray, bodies)
-    table = PackedConstants.of(_merged(capacity.row, bodies.rows))
+    rows = _merged(capacity.row, bodies.rows)
+    table = PackedConstants.of(rows)
     number = lambda x: x.astype(table.data.dtype)  # noqa: E731
     own, to = bodies.slot, bodies.source
     parent = jnp.maximum(to, 0)
@@ -422,7 +423,6 @@ def make_batched_trees(
         stack_indices = StackIndices(own, parent, to, inner, apart)
     met = None
     if capacity.meetings:
-        rows = _merged(capacity.row, bodies.rows)
         rows = rows if rows.shells is None else replace(rows, count=capacity.rows)
         boxes = Boxes.of((_merged(capacity.root, bodies.root), rows), table.data.dtype)
         body = np.append(

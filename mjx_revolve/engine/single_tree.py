@@ -302,11 +302,12 @@ def _make_level(
         lists = [items[owner[items] == body] for body in bodies]
         return np.array([*itertools.zip_longest(*lists, fillvalue=-1)], int).reshape(-1, len(lists))
 
-    parts = {}
+    parts, carried = {}, columns.parts.carried
     for k, laws in enumerate(columns.laws):
         rows = stack(np.flatnonzero(columns.part_laws == k), columns.part_body)
         # Nothing acts on a group that neither floats nor drags nor carries nor pushes.
-        if len(rows) and (not laws.idle or _carries(columns, rows)):
+        linear = () if carried is None else carried.inertia.linear
+        if len(rows) and (not laws.idle or any(np.any(x[rows]) for x in linear)):
             parts[laws] = rows
     points = stack(np.arange(len(columns.point_body) * contact), columns.point_body)
     shells = stack(active, columns.part_body)
@@ -315,10 +316,3 @@ def _make_level(
         columns, np.array(bodies), parts, points, shells, root, len(bodies), finish
     )
     return level, tuple(parts[laws] for laws in sorted(parts)), points, shells
-
-
-def _carries(columns: StepConstants, rows: np.ndarray) -> bool:
-    carried = columns.parts.carried
-    return carried is not None and any(
-        np.any(x[rows]) for x in jax.tree.leaves(carried.inertia.linear)
-    )

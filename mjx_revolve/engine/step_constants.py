@@ -113,6 +113,13 @@ def _z_frame(axis: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(axis, x), axis], 1)
 
 
+def _z_frames(axes: np.ndarray) -> np.ndarray:
+    """`[n, 3, 3]` of `[n, 3]` axes, which are few different ones."""
+    different = {axis.tobytes(): axis for axis in axes}
+    frames = {key: _z_frame(axis) for key, axis in different.items()}
+    return np.array([frames[axis.tobytes()] for axis in axes])
+
+
 def _vec(x: np.ndarray) -> Any:
     x = clean(x)
     return tuple(x[:, i] for i in range(3))
@@ -201,8 +208,7 @@ def _falls(assembly: Assembly) -> np.ndarray:
 
 def hinge_frames(assembly: Assembly) -> np.ndarray:
     """`[nbody, 3, 3]` body frame from the step's own frame, which has z along the hinge."""
-    frames = {axis: _z_frame(np.array(axis)) for axis in set(map(tuple, assembly.axis.tolist()))}
-    return np.array([frames[axis] for axis in map(tuple, assembly.axis.tolist())])
+    return _z_frames(assembly.axis)
 
 
 def _read_hinges(assembly: Assembly, frame: np.ndarray, pairs: np.ndarray) -> Hinges:
@@ -210,12 +216,7 @@ def _read_hinges(assembly: Assembly, frame: np.ndarray, pairs: np.ndarray) -> Hi
     up = frame[assembly.parent].swapaxes(1, 2)
     # At rest, ours of the child seen from ours of the parent.
     rest = clean(up @ rotation @ frame)
-    known: dict[bytes, np.ndarray] = {}
-    keys = [axis.tobytes() for axis in rest[:, :, 2]]
-    for key, axis in zip(keys, rest[:, :, 2], strict=True):
-        if key not in known:
-            known[key] = _z_frame(axis)
-    toward = np.array([known[key] for key in keys])
+    toward = _z_frames(rest[:, :, 2])
     offset = clean(turned(toward.swapaxes(1, 2), rest[:, :, 0]))
     jointed = assembly.parent > 0
 
