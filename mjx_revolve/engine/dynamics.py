@@ -124,8 +124,7 @@ def accelerate(
 
     def turning(motion: BodyMotion) -> tuple[Vec, Vec]:
         """The velocity with which momenta turn: as MuJoCo's step has it, the step's first one."""
-        first = motion.angular_velocity, motion.velocity
-        return first if symmetric else motion.midpoint_velocity
+        return motion.twist if symmetric else motion.midpoint_velocity
 
     def axis_of(motion: BodyMotion) -> tuple[Vec, Vec]:
         """The hinge's axis, half a step ahead where momenta are."""
@@ -362,12 +361,11 @@ def midpoint_forces(
     if not motion.midpoint or not dt:
         return water_forces(world, level, motion, gravity, water, thrusts, before)
     share = implicit_share(world, level, motion, water, dt)
-    begun = motion.angular_velocity, motion.velocity
     angular, linear = (
         vadd(v, vscale(sub(1, share), vsub(middle, v)))
-        for v, middle in zip(begun, motion.midpoint, strict=True)
+        for v, middle in zip(motion.twist, motion.midpoint, strict=True)
     )
-    ahead = motion._replace(angular_velocity=angular, velocity=linear, begun=begun)
+    ahead = motion._replace(angular_velocity=angular, velocity=linear, begun=motion.twist)
     external = water_forces(world, level, ahead, gravity, water, thrusts, before)
     if external.damping is None:
         return external
@@ -436,7 +434,7 @@ def _inertia_and_bias(
     block = block_of(inertia)
     if not symmetric:
         block = add_block(block, 0.5 * dt, gyroscope(*momentum))
-    bias = cross_force(motion.angular_velocity, motion.velocity, *momentum)
+    bias = cross_force(*motion.twist, *momentum)
     return block, (vsub(bias[0], torque), vsub(bias[1], force))
 
 

@@ -181,7 +181,7 @@ def _on_bodies(
 
     `motions`: at the step's beginning, with the velocities of its end, and a step before.
     """
-    begun, motion = ((x.angular_velocity, x.velocity) for x in motions[:2])
+    begun, motion = (x.twist for x in motions[:2])
     mean = tuple(vscale(0.5, vadd(a, b)) for a, b in zip(begun, motion, strict=True))
     at = motions[1]
     gravity = effective_gravity(world, water, at)

@@ -198,10 +198,7 @@ def _flow_at_the_beginning(parts: Parts, motion: BodyMotion, flow: PartFlow) -> 
     """The flow past parts with the velocities of the step's beginning, for the slam."""
     if motion.begun is None:
         return flow
-    angular, linear = (
-        vsub(x, y)
-        for x, y in zip(motion.begun, (motion.angular_velocity, motion.velocity), strict=True)
-    )
+    angular, linear = (vsub(x, y) for x, y in zip(motion.begun, motion.twist, strict=True))
     velocity = matTvec(parts.rotation, vadd(linear, cross(angular, parts.position)))
     return flow._replace(
         velocity=vadd(flow.velocity, velocity),
@@ -314,7 +311,7 @@ def _coupled_slam(
     carried: CarriedWater, stream: _Stream, motion: BodyMotion, rate: Scalar
 ) -> tuple[Vec, Vec]:
     """Torque and force of the slam on parts that carry a whole 6×6, about the bodies' origins."""
-    angular_velocity, velocity = motion.begun or (motion.angular_velocity, motion.velocity)
+    angular_velocity, velocity = motion.begun or motion.twist
     if stream.velocity is not None:
         velocity = vsub(velocity, stream.velocity)
     torque, force = apply_inertia(carried.inertia, angular_velocity, velocity)
@@ -456,17 +453,16 @@ def _water_on_parts(
         mass = tuple(map(mul, own.mass, close.share))
         here = diagonal_inertia(tuple(map(mul, own.angular, spins)), mass)
         carried = _damping(parts, here, None, gather)
-        found = _plus(
-            _damping(parts, damping, angular, gather), _damping(parts, close.damping, None, gather)
-        )
-        return torque, force, carried, found, submerged, saved
-    if parts.carries and parts.carried is not None:
+    elif parts.carries and parts.carried is not None:
 
         def weigh(x: Scalar) -> Scalar:
             return sum_parts(mul(x, submerged), k) if is_present(x) else 0.0
 
         carried = jax.tree.map(weigh, parts.carried.inertia)
-    return torque, force, carried, _damping(parts, damping, angular, gather), submerged, saved
+    resistance = _damping(parts, damping, angular, gather)
+    if close is not None:
+        resistance = _plus(resistance, _damping(parts, close.damping, None, gather))
+    return torque, force, carried, resistance, submerged, saved
 
 
 class PartForces(NamedTuple):

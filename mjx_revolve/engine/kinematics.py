@@ -75,9 +75,7 @@ def forward_kinematics(
     def move(level: Level, parent: BodyMotion, angle: Scalar, speed: Scalar, ahead: Scalar) -> Any:
         assert level.hinges is not None
         rotation, position = hinge_rotation(level.hinges, angle), level.hinges.position
-        angular_velocity, velocity = _child_velocity(
-            rotation, position, (parent.angular_velocity, parent.velocity), speed
-        )
+        angular_velocity, velocity = _child_velocity(rotation, position, parent.twist, speed)
         x_axis, y_axis, xy = None, None, None
         if located:
             x_axis, y_axis = matTvec(rotation, parent.x_axis), matTvec(rotation, parent.y_axis)

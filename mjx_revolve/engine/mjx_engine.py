@@ -449,7 +449,7 @@ def _add_water(
         implicit.append(dt * _dense(external.damping, n))
     if tree.carries:
         rigid, _, momentum = inertia_and_momentum(constants, external, midpoint)
-        turning = cross_force(motion.angular_velocity, motion.velocity, *momentum)
+        turning = cross_force(*motion.twist, *momentum)
         wrench = wrench - jnp.concatenate([_stack(x, n) for x in turning], -1)
         # The mass matrix holds the rigid inertia; its J̇ q̇ is missing, and how axes turn.
         wrench = wrench - jnp.einsum("bij,bj->bi", _dense(rigid, n), drift)

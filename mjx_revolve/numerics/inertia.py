@@ -62,9 +62,14 @@ class BodyMotion(NamedTuple):
     begun: Any = None
 
     @property
+    def twist(self) -> tuple[Vec, Vec]:
+        """Angular and linear velocity."""
+        return self.angular_velocity, self.velocity
+
+    @property
     def midpoint_velocity(self) -> tuple[Vec, Vec]:
         """Angular and linear velocity with which momenta turn."""
-        return self.midpoint or (self.angular_velocity, self.velocity)
+        return self.midpoint or self.twist
 
     @property
     def position(self) -> Vec:
