@@ -14,7 +14,7 @@ import numpy as np
 
 from mjx_revolve.body.module_types import Part
 from mjx_revolve.body.morphology import Morphology
-from mjx_revolve.body.placement import RestPose, rest_pose, turned
+from mjx_revolve.body.placement import Module, RestPose, rest_pose, turned
 from mjx_revolve.engine.fluid_table import FluidTable, make_fluid_table
 from mjx_revolve.engine.self_pairs import hinge_stops, meeting_pairs
 from mjx_revolve.inputs.short_repr import short_repr
@@ -132,6 +132,11 @@ class Assembly:
         return replace(self, implicit_stiffness=self.stiffness - explicit)
 
     @property
+    def modules(self) -> list[Module]:
+        """The modules of all robots."""
+        return [module for body in self.morphologies for module in body.modules]
+
+    @property
     def moved(self) -> np.ndarray:
         """`[nhinges]` the bodies that hinges carry."""
         return np.flatnonzero(self.parent)
@@ -163,10 +168,8 @@ class Assembly:
         To the right of the way in which its module is attached, z up; a core looks along its y.
         Body frame.
         """
-        layout, table, ways = self.layout, self.fluid, []
-        for body in self.morphologies:
-            mounts = [module.kind.mount for module in body.modules]
-            ways += [(0.0, 1.0, 0.0) if mount is None else mount.outward for mount in mounts]
+        layout, table, mounts = self.layout, self.fluid, [m.kind.mount for m in self.modules]
+        ways = [(0.0, 1.0, 0.0) if mount is None else mount.outward for mount in mounts]
         right = np.cross(ways, (0.0, 0.0, 1.0))[layout.module]
         middle = table.position + turned(table.rotation, (layout.low + layout.high) / 2)
         right = turned(table.rotation, right)

@@ -401,7 +401,7 @@ def _widest_bodies(columns: StepConstants, sizes: _Sizes, modules: int) -> _Size
     """Sizes with room for the most parts on one body of the robots' types of modules."""
     assembly = columns.assembly
     module, nbody = assembly.layout.module, len(assembly.parent)
-    is_core = np.array([m.parent < 0 for body in assembly.morphologies for m in body.modules])
+    is_core = np.array([m.parent < 0 for m in assembly.modules])
     parts, root_parts = {}, {}
     for k, laws in enumerate(columns.laws):
         held = columns.part_laws == k
@@ -418,15 +418,14 @@ def _most_rows(
 ) -> int:
     """The most rows of bodies of the robots' types of modules, with at most so many of them."""
     assembly = columns.assembly
-    all_modules = [module for body in assembly.morphologies for module in body.modules]
-    core = np.array([m.parent < 0 for m in all_modules])
-    turns = np.array([m.kind.hinge is not None for m in all_modules])
+    core = np.array([m.parent < 0 for m in assembly.modules])
+    turns = np.array([m.kind.hinge is not None for m in assembly.modules])
     found = 0
     for count in range(min(hinges, modules - 1) + 1):
         rows = count
         for group in groups:
             held = columns.part_laws == columns.laws.index(group.laws)
-            parts = np.bincount(assembly.layout.module[held], minlength=len(all_modules))
+            parts = np.bincount(assembly.layout.module[held], minlength=len(core))
             most = [int(parts[x].max(initial=0)) for x in (core, turns, ~(core | turns))]
             total = most[0] + count * most[1] + (modules - 1 - count) * most[2]
             # Each hinge's body has a part in no overflow row; so has the root, or it is full.

@@ -136,7 +136,7 @@ def _poses(assembly: Assembly) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     module, table = assembly.layout.module, assembly.fluid
     first = np.flatnonzero(np.append(True, np.diff(module) > 0))
     last = np.append(first[1:], len(module)) - 1
-    hinged = [m.kind.hinge is not None for body in assembly.morphologies for m in body.modules]
+    hinged = [m.kind.hinge is not None for m in assembly.modules]
     part = np.where(hinged, last, first)
     body = table.body[part]
     back = hinge_frames(assembly)[body].swapaxes(1, 2)
@@ -145,7 +145,7 @@ def _poses(assembly: Assembly) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _firsts(assembly: Assembly, name: str, bodies: np.ndarray) -> np.ndarray:
     """The first module of a type on each body that has one."""
-    kinds = np.array([m.kind.name for body in assembly.morphologies for m in body.modules])
+    kinds = np.array([m.kind.name for m in assembly.modules])
     chosen = np.flatnonzero(kinds == name)
     return chosen[np.unique(bodies[chosen], return_index=True)[1]]
 
