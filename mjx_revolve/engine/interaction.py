@@ -405,9 +405,6 @@ def make_interaction(
     """
     found = None if contact is None else _Contact(trees, spheres, present, worlds, contact)
 
-    def init(state: State) -> Any:
-        return () if found is None else found.init(state)
-
     def detect(state: State, neighbours: Any) -> tuple[InteractionForces, Any]:
         wrench: Any = ()
         if found is not None:
@@ -417,7 +414,7 @@ def make_interaction(
         nearest = nearest_robot(state.position, worlds, present, tag)
         return InteractionForces(wrench, *nearest), neighbours
 
-    return RobotInteraction(init, detect)
+    return RobotInteraction((lambda _: ()) if found is None else found.init, detect)
 
 
 class _Contact:

@@ -260,7 +260,6 @@ class Rollout:
             The state after the last step, and the records, `[records, ...]` each.
         """
         step: Callable[..., Any] = self.step
-        pack: Callable[[PyTree], PyTree]
         pack = unpack = lambda x: x
         # Interaction between robots is not element-wise, so it stays outside of the fused step.
         interaction = self.engine.interaction
