@@ -46,7 +46,7 @@ def fold(a: np.ndarray) -> float | np.ndarray:
 
 
 def _as(a: Scalar, like: jax.Array) -> Scalar:
-    """A constant in the dtype of the other operand: NumPy's float64 must not widen float32."""
+    """A number; a constant in the other's dtype: NumPy's float64 must not widen float32."""
     return np.asarray(a, like.dtype) if isinstance(a, np.ndarray | np.generic) else a
 
 
@@ -85,11 +85,7 @@ def add(a: Scalar, b: Scalar) -> Scalar:
         return a
     if _constant(a) and _constant(b):
         return a + b
-    if _constant(a):
-        return _as(a, b) + b
-    if _constant(b):
-        return a + _as(b, a)
-    return a + b
+    return _as(a, b) + _as(b, a)
 
 
 def neg(a: Scalar) -> Scalar:

@@ -33,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_revolve.numerics.inertia import SpatialInertia
-from mjx_revolve.numerics.spatial import NO_MATRIX, SYM, Scalar, Vec, diagonal, mul, total
+from mjx_revolve.numerics.spatial import NO_MATRIX, SYM, Scalar, Vec, diagonal, dot, mul, total
 from mjx_revolve.water.added_mass import CarriedWater
 from mjx_revolve.water.coefficients import TODAY
 
@@ -82,11 +82,11 @@ def near_surface(
     """
     square = tuple(x * x for x in up)
     size = tuple(mul(2, x) for x in half_size)
-    reach = total(*[mul(jnp.abs(x), h) for x, h in zip(up, half_size, strict=True)])
+    reach = dot(tuple(map(jnp.abs, up)), half_size)
     seen = total(*[mul(jnp.abs(up[i]), size[j] * size[k]) for i, j, k in _TURNS])
     draught = mul(submerged, size[0] * size[1] * size[2]) / seen
     narrow = tuple(jnp.minimum(size[j], size[k]) for _, j, k in _TURNS)
-    breadth = total(*[mul(x, b) for x, b in zip(square, narrow, strict=True)])
+    breadth = dot(square, narrow)
     under = jnp.maximum(depth - reach, 0)
     image = (reach / (reach + under)) ** 2
     length = draught + 0.5 * breadth  # 1 / k
@@ -100,12 +100,8 @@ def near_surface(
         x + mul(inside, submerged - x) for x, inside in zip(along, carried.entrained, strict=True)
     )
     # Waves: b / m, with m the deep added mass, ρ B² to the length.
-    deep = total(
-        *[
-            mul(x, mul(m, 1 - inside))
-            for x, m, inside in zip(square, carried.mass, carried.entrained, strict=True)
-        ]
-    )
+    pairs = zip(carried.mass, carried.entrained, strict=True)
+    deep = dot(square, tuple(mul(m, 1 - inside) for m, inside in pairs))
     beta = 0.5 * breadth / length
     sine, fall = jnp.sin(beta), jnp.exp(beta - 1)  # k T = 1 - β
     rate = 4 * sine * sine * fall * fall * length**1.5 / (breadth * breadth)
