@@ -511,6 +511,11 @@ class Config(Settings):
             return error
         return InputError(self.origin(text.partition(":")[0]) + text)
 
+    def require_population(self, why: str) -> None:
+        """Raises `InputError` where the engine is another one."""
+        if self.engine != "population":
+            raise InputError(f"{self._source}: engine", f"population, {why}", self.engine)
+
     @property
     def name(self) -> str:
         """A short name: the file's name without its suffix."""

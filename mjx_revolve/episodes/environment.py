@@ -274,9 +274,7 @@ def make_environment(
             sensors.
     """
     config = fitness.config
-    if config.engine != "population":
-        needed = "population, to step environments"
-        raise InputError(f"{config.source}: engine", needed, config.engine)
+    config.require_population("to step environments")
     plant = fitness.engine.plant
     if plant.num_actuators == 0:
         needed = "a hinge or a thruster to act with"

@@ -583,8 +583,7 @@ def make_mixed_fitness(
             of one kind; the message says where.
     """
     config = _read(config, overrides)
-    if config.engine != "population":
-        raise InputError(f"{config.source}: engine", "population, as bodies differ", config.engine)
+    config.require_population("as bodies differ")
     world, task = _place(config)
     robots = [_build(config, world, morphology) for morphology in examples]
     for robot in robots:

@@ -221,9 +221,7 @@ def make_windows(fitness: Fitness, horizon: float | None = None) -> TruncatedBPT
         InputError: an episode is not a whole number of such windows, or the engine is MJX's.
     """
     config, records = fitness.config, fitness.num_records
-    if config.engine != "population":
-        needed = "population, to go back through its steps"
-        raise InputError(f"{config.source}: engine", needed, config.engine)
+    config.require_population("to go back through its steps")
     if config.task.target_turn is not None:
         none = "none, as windows do not carry a pursuer on"
         turn = f"{config.task.target_turn:g}"
