@@ -116,9 +116,7 @@ class SingleTree:
 
     def tree_to_joints(self, values: Sequence[jax.Array], like: jax.Array) -> jax.Array:
         """`[nhinge, lanes]` in the robot's order."""
-        if not self.below:
-            return jnp.zeros((0, *like.shape), like.dtype)
-        return jnp.concatenate(values)[np.argsort(self.hinge_order).astype(np.int32)]
+        return self.join_rows(values, like)[np.argsort(self.hinge_order).astype(np.int32)]
 
     def join_rows(self, values: Sequence[jax.Array], like: jax.Array) -> jax.Array:
         """`[nhinge, lanes]` in the order of the levels."""
