@@ -205,13 +205,12 @@ def read_events(folder: Path) -> tuple[list[Event], list[str]]:
         The events in the order of time, and a line about each thing that is wrong.
     """
     lines, wrong = _read_lines(folder / EVENTS, _Event)
-    found = []
-    for line, _ in lines:
-        place = np.array([math.nan if x is None else x for x in line.place])
-        more = line.other, line.cause, line.parents
-        found.append(Event(line.time, line.event, line.id, place, *more))
+    events = [
+        Event(x.time, x.event, x.id, np.array(x.place, float), x.other, x.cause, x.parents)
+        for x, _ in lines
+    ]
     # Within an interval they are as they were written.
-    return sorted(found, key=lambda event: event.time), wrong
+    return sorted(events, key=lambda event: event.time), wrong
 
 
 Line = TypeVar("Line", bound=_Line)

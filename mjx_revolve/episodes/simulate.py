@@ -104,9 +104,8 @@ def _compiled(
             parameters = controller.decode(drive_input[:, None], simulator.plant)
             policy = controlled(controller, parameters)
             controller_state = controller.init(parameters)
-        moving = None if still else water
-        if moving is not None:
-            moving = jax.tree.map(lambda x: jnp.broadcast_to(x, (steps,))[:, None], moving)
+        wide = lambda x: jnp.broadcast_to(x, (steps,))[:, None]  # noqa: E731
+        moving: Water | None = None if still else jax.tree.map(wide, water)
         signals = () if controller is None else controller.signals
         rollout = Rollout(simulator, policy, robot.world, water_of(robot.world), context, signals)
 

@@ -237,8 +237,6 @@ def load_world(name: str | Path, **overrides: Any) -> World:
         fields: dict[Any, Any] = {"name": path.stem} | data
         # A world file names its field's file from where it stands itself.
         world: World = read(World, fields, context=path.parent)
-    if not overrides:
-        return _note_of_density(world)
     for key, value in overrides.items():
         # A mapping changes what it names and keeps the rest: a bed's friction, not its whole shape.
         below = fields.get(key)
@@ -252,8 +250,9 @@ def load_world(name: str | Path, **overrides: Any) -> World:
             kind = below.get("kind", "flat")
             alike = value.get("kind", kind) == kind
             overrides[key] = {**below, **value} if alike else value
-    with reading(f"world {world.name}"):
-        world = read(World, fields | {"current_field": world.current_field} | overrides)
+    if overrides:
+        with reading(f"world {world.name}"):
+            world = read(World, fields | {"current_field": world.current_field} | overrides)
     return _note_of_density(world)
 
 
