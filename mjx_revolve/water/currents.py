@@ -323,11 +323,10 @@ def _read_table(path: Path) -> CurrentField:
     shape = tuple(len(axis) for axis in axes)
     index = tuple(np.searchsorted(axis, columns[n]) for axis, n in zip(axes, "xyz", strict=True))
     expected = f"one row for each of {' x '.join(map(str, shape))} points of a full grid"
-    order = np.lexsort(index)
-    flat = np.stack(index)[:, order]
-    twice = np.flatnonzero(np.all(flat[:, 1:] == flat[:, :-1], axis=0))
-    if len(twice):
-        point = ", ".join(f"{axis[i]:g}" for axis, i in zip(axes, flat[:, twice[0]], strict=True))
+    points, counts = np.unique(np.stack(index[::-1]), axis=1, return_counts=True)
+    if np.any(counts > 1):
+        first = points[::-1, np.argmax(counts > 1)]
+        point = ", ".join(f"{axis[i]:g}" for axis, i in zip(axes, first, strict=True))
         raise InputError(f"expected {expected}; found ({point}) twice")
     if len(table) != math.prod(shape):
         raise InputError(f"expected {expected}; found {len(table)} rows")
