@@ -54,18 +54,6 @@ class TankTrajectory(NamedTuple):
         return self.qpos[:, :3]
 
 
-@dataclass
-class _Slots:
-    """Properties of a tank's places, on the last axis."""
-
-    genes: np.ndarray
-    start: np.ndarray
-    new: np.ndarray
-    since: np.ndarray
-    tag: np.ndarray
-    noise: np.ndarray
-
-
 class _Given(NamedTuple):
     """Inputs of a compiled stretch of time; places on the last axis."""
 
@@ -113,18 +101,19 @@ class Tank:
         """An empty tank."""
         count = self.places
         self.robots = [None] * count
-        self._slots = _Slots(
-            genes=np.zeros((self.mixed.num_genes, count), np.float32),
-            start=np.zeros((7, count), np.float32),
-            new=np.zeros(count, bool),
-            since=np.zeros(count, np.int64),
-            tag=np.zeros(count, np.float32),
-            noise=np.arange(count, dtype=np.uint32),
-        )
         # Empty places are far apart.
-        self._slots.start[0] = 1e3 + 10.0 * np.arange(count)
-        self._slots.start[2] = self.world.surface_height - 1
-        self._slots.start[3] = 1
+        start = np.zeros((7, count), np.float32)
+        start[0] = 1e3 + 10.0 * np.arange(count)
+        start[2], start[3] = self.world.surface_height - 1, 1
+        # Properties of the places, on the last axis: fields of `_Given`.
+        self._slots = {
+            "genes": np.zeros((self.mixed.num_genes, count), np.float32),
+            "start": start,
+            "new": np.zeros(count, bool),
+            "since": np.zeros(count, np.int64),
+            "tag": np.zeros(count, np.float32),
+            "noise": np.arange(count, dtype=np.uint32),
+        }
         self._current = np.array(self.world.current, np.float32)
         self._bodies: Any = None
         self._spheres: Any = None
@@ -153,7 +142,7 @@ class Tank:
     @property
     def tag(self) -> np.ndarray:
         """`[places]` numbers that identify robots to sensors."""
-        return self._slots.tag
+        return self._slots["tag"]
 
     @property
     def alive(self) -> np.ndarray:
@@ -167,7 +156,7 @@ class Tank:
 
     def age(self, place: int) -> float:
         """The time since a robot was added [s]."""
-        return float(self.steps - self._slots.since[place]) * self.timestep
+        return float(self.steps - self._slots["since"][place]) * self.timestep
 
     # --- robots
 
@@ -217,11 +206,11 @@ class Tank:
         self._put(place, robot)
         self.robots[place] = robot
         slots = self._slots
-        slots.genes[:, place] = wide
-        slots.start[:, place] = (*position, *np.asarray(quat, float) / size)
-        slots.since[place] = self.steps
-        slots.new[place] = True
-        slots.noise[place] = seed
+        slots["genes"][:, place] = wide
+        slots["start"][:, place] = (*position, *np.asarray(quat, float) / size)
+        slots["since"][place] = self.steps
+        slots["new"][place] = True
+        slots["noise"][place] = seed
         return place
 
     def remove(self, place: int) -> None:
@@ -321,16 +310,15 @@ class Tank:
         state, qpos, energy = self._stretch(rows, stride)(given, state)
         self.state = jax.tree.map(np.asarray, state)
         self.steps += rows * stride
-        self._slots.new[:] = False
+        self._slots["new"][:] = False
         return TankTrajectory(time, np.asarray(qpos), np.asarray(energy), alive)
 
     def _given(self) -> _Given:
         """The inputs of a stretch that begins now."""
-        slots = self._slots
+        slots = self._slots | {"since": (self._slots["since"] - self.steps).astype(np.int32)}
         return _Given(
-            self._bodies, self._spheres, slots.genes, slots.start, slots.new, self.alive,
-            (slots.since - self.steps).astype(np.int32), slots.tag, self.target, slots.noise,
-            self._current, np.float32(self.time),
+            self._bodies, self._spheres, **slots, alive=self.alive, target=self.target,
+            current=self._current, time=np.float32(self.time),
         )  # fmt: skip
 
     def _engine(self, given: _Given) -> Engine:
@@ -387,7 +375,7 @@ class Tank:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """All but the robots themselves, as named arrays."""
-        found = {name: x.copy() for name, x in vars(self._slots).items()}
+        found = {name: x.copy() for name, x in self._slots.items()}
         found |= {"steps": np.asarray(self.steps), "current": self.current, "alive": self.alive}
         if self.target is not None:
             found["target"] = self.target.copy()
@@ -411,7 +399,7 @@ class Tank:
         for place, robot in robots.items():
             self._put(place, robot)
             self.robots[place] = robot
-        self._slots = _Slots(**{name: arrays[name].copy() for name in vars(self._slots)})
+        self._slots = {name: arrays[name].copy() for name in self._slots}
         self.steps, self._current = int(arrays["steps"]), arrays["current"].copy()
         self.target = arrays["target"].copy() if "target" in arrays else None
         if "passage.0" in arrays and self._bodies is not None:
