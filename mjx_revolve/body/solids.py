@@ -144,6 +144,16 @@ def _shell(
     return walls
 
 
+def _crate(half: np.ndarray, wall: float, room: np.ndarray, round_: bool) -> list[_Body]:
+    """Hollow box about the origin with a window in each face, a circle or all of the room."""
+    windows = {}
+    for axis in range(3):
+        u, v = room[(axis + 1) % 3], room[(axis + 2) % 3]
+        least = min(u, v)
+        windows[axis, 1] = windows[axis, -1] = (least,) * 3 if round_ else (u, v, 0.5 * least)
+    return _shell(2.0 * half, wall, windows)
+
+
 def _core(kind: ModuleType, part: Part) -> list[_Body] | None:
     """Box with a wide window in each side wall, a round one in the lid and a closed floor."""
     half = 0.5 * np.asarray(part.boxes[0].size)
@@ -165,12 +175,7 @@ def _brick(kind: ModuleType, part: Part) -> list[_Body] | None:
     half = 0.5 * np.asarray(part.boxes[0].size)
 
     def build(wall: float) -> list[_Body]:
-        room = _WINDOW * (half - wall)
-        windows = {}
-        for axis in range(3):
-            radius = min(room[(axis + 1) % 3], room[(axis + 2) % 3])
-            windows[axis, 1] = windows[axis, -1] = (radius, radius, radius)
-        return _shell(2.0 * half, wall, windows)
+        return _crate(half, wall, _WINDOW * (half - wall), round_=True)
 
     return _solve(build, 1e-3 * half.min(), 0.95 * half.min(), part.volume)
 
@@ -357,12 +362,7 @@ def _generic(part: Part) -> list[_Body]:
 
         def build(s: float, half: np.ndarray = half) -> list[_Body]:
             wall = s * half.min()
-            room = _WINDOW * (1.0 - s) * (half - wall)
-            windows = {}
-            for axis in range(3):
-                u, v = room[(axis + 1) % 3], room[(axis + 2) % 3]
-                windows[axis, 1] = windows[axis, -1] = (u, v, 0.5 * min(u, v))
-            return _shell(2.0 * half, wall, windows)
+            return _crate(half, wall, _WINDOW * (1.0 - s) * (half - wall), round_=False)
 
         shell = None
         if share < _SOLID:
