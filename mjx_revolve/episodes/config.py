@@ -511,6 +511,10 @@ class Config(Settings):
             return error
         return InputError(self.origin(text.partition(":")[0]) + text)
 
+    def misfit(self, place: str, expected: str, found: object) -> InputError:
+        """The error of a setting that does not fit others, or the files that they name."""
+        return InputError(f"{self.origin(place)}{place}", expected, found)
+
     def require_population(self, why: str) -> None:
         """Raises `InputError` where the engine is another one."""
         if self.engine != "population":

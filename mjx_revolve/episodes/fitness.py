@@ -674,20 +674,17 @@ def _place(config: Config) -> tuple[World, Task]:
             "bed; found none"
         )
     if task.on_bed and config.task.start_attitude != "level":
-        place = f"{config.origin('task.start_attitude')}task.start_attitude"
         level = f"level, as {config.task.name} starts on the bed"
-        raise InputError(place, level, config.task.start_attitude)
+        raise config.misfit("task.start_attitude", level, config.task.start_attitude)
     if world.bed is not None and config.colony is None:
         deepest = world.surface_height - float(bed_height(world.bed, *np.zeros((2, 1)))[0])
         if task.start is start_at_depth and config.task.depth >= deepest:
-            place = f"{config.origin('task.depth')}task.depth"
             least = f"one above the bed, which is {deepest:g} m below the surface"
-            raise InputError(place, least, f"{config.task.depth:g}")
+            raise config.misfit("task.depth", least, f"{config.task.depth:g}")
         height = config.task.height
         if task.start is start_above_bed and height is not None and height >= deepest:
-            place = f"{config.origin('task.height')}task.height"
             most = f"one below the surface, which is {deepest:g} m above the bed"
-            raise InputError(place, most, f"{height:g}")
+            raise config.misfit("task.height", most, f"{height:g}")
     _check_robust(config, world)
     return world, task
 
@@ -750,9 +747,8 @@ def _find_controller(
     if settings.depth is None:
         task = TASKS.get(config.task.type)
         if settings.type == "feedback" and task is not None and task.on_bed:
-            place = f"{config.origin('controller.depth')}controller.depth"
             depth = f"a depth [m], as {config.task.type} does not start at task.depth"
-            raise InputError(place, depth, "none")
+            raise config.misfit("controller.depth", depth, "none")
         settings = settings.model_copy(update={"depth": config.task.depth})
     try:
         return find_controller(plant, settings, config.source, example, body)

@@ -435,8 +435,8 @@ def make_tank(
         InputError: the world is gusty, or its bed may be touched and there is no room for that.
     """
     if mixed.world.gust is not None:
-        place = f"{mixed.config.origin('world')}world"
-        raise InputError(place, "a world without gusts, which are drawn for episodes", "some")
+        calm = "a world without gusts, which are drawn for episodes"
+        raise mixed.config.misfit("world", calm, "some")
     if mixed.world.bed is not None and not mixed.touches:
         colony = "a fitness with a colony where there is a bed, which robots reach in a long life"
         raise InputError("tank", colony, "one for episodes that end before")
