@@ -116,9 +116,7 @@ def no_commands(engine: Engine, like: Float[Array, "... lanes"]) -> Float[Array,
 
 def with_variation(engine: Engine, variation: Variation | None) -> Engine:
     """An engine with the coefficients of an episode; the same one where they are not varied."""
-    if variation is None:
-        return engine
-    return engine.with_variation(variation)
+    return engine if variation is None else engine.with_variation(variation)
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,9 +51,7 @@ def to_parent(
     torque, force = (matvec(turn, x) for x in bias)
     r = skew(position)
     shifted = madd(across, matmul(r, linear))
-    below = transpose(shifted)
-    if not symmetric:
-        below = tuple(map(vsub, back, matmul(linear, r)))
+    below = transpose(shifted) if symmetric else tuple(map(vsub, back, matmul(linear, r)))
     first, second = matmul(r, back), matmul(shifted, r)
     entry = lambda i, j: sub(add(angular[i][j], first[i][j]), second[i][j])  # noqa: E731
     moved = _square(entry, symmetric)
