@@ -823,14 +823,7 @@ def _hang(assembly: Assembly, order: RowOrder, capacity: Capacity) -> dict[str, 
     # Behind its root, a robot's bodies stand in the order of its hinges.
     index = order.body[real] - assembly.roots[robot] - 1
     hinge[place, robot], row[index, robot] = index, place
-    return {
-        "slot": slot,
-        "source": source,
-        "inner": inner,
-        "hinge": hinge,
-        "row": row,
-        "count": order.length,
-    }
+    return dict(slot=slot, source=source, inner=inner, hinge=hinge, row=row, count=order.length)
 
 
 def _wire(assembly: Assembly, row: np.ndarray, capacity: Capacity) -> Plant:

@@ -702,13 +702,6 @@ def _side(frame: jax.Array, numbers: jax.Array) -> _Side:
     origin = tuple(f[:3])
     place = lambda local: vadd(origin, matvec(axes, tuple(local)))  # noqa: E731
     return _Side(
-        place(x[:3]),
-        origin,
-        place(x[3:6]),
-        tuple(f[3:6]),
-        tuple(f[6:9]),
-        axes,
-        x[6],
-        x[7],
-        tuple(x[8:14]),
-    )
+        place(x[:3]), origin, place(x[3:6]), tuple(f[3:6]), tuple(f[6:9]), axes,
+        x[6], x[7], tuple(x[8:14]),
+    )  # fmt: skip

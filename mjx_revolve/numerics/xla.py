@@ -60,14 +60,9 @@ OLD_EMITTERS: dict[str, bool] = (
 
 # Views and copies: nothing is computed, so there is nothing to share.
 _VIEWS = {
-    "broadcast_in_dim",
-    "concatenate",
-    "convert_element_type",
-    "copy",
-    "reshape",
-    "slice",
+    "broadcast_in_dim", "concatenate", "convert_element_type", "copy", "reshape", "slice",
     "squeeze",
-}
+}  # fmt: skip
 
 _COST |= dict.fromkeys(_VIEWS, 0)
 _LOOPS = {"cond", "scan", "while"}

@@ -22,20 +22,8 @@ OFF = PartDragLaw(
     sdf=Export(""),
 )
 
-DRAG_LAWS: dict[str, DragLaw] = {
-    law.name: law
-    for law in (
-        FACES,
-        LIFT_DRAG,
-        FOSSEN,
-        CROSS_FLOW,
-        PLATE_WAKE,
-        FIN_WAKE,
-        INERTIA_BOX,
-        ELLIPSOID,
-        OFF,
-    )
-}
+_LAWS = (FACES, LIFT_DRAG, FOSSEN, CROSS_FLOW, PLATE_WAKE, FIN_WAKE, INERTIA_BOX, ELLIPSOID, OFF)
+DRAG_LAWS: dict[str, DragLaw] = {law.name: law for law in _LAWS}
 """The drag laws by the names that worlds and modules give."""
 
 
