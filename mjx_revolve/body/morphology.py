@@ -229,23 +229,12 @@ def read_module(
         changed = apply_overrides(kind, params) if params else kind
     except InputError as error:
         raise InputError(f"{place}.params: {error}") from None
-    position, rotation = _ORIGIN
+    pose = _ORIGIN
     if parent >= 0:
         above = tree[parent]
-        position, rotation = attach(above, above.kind.slots[slot], changed, orientation)
-    return Module(
-        name=_read_id(item.get("id"), f"{place}.id") or f"{kind.name}{len(tree)}",
-        type=kind.name,
-        parent=parent,
-        slot=slot,
-        orientation=orientation,
-        rgb=rgb,
-        position=position,
-        rotation=rotation,
-        kind=changed,
-        params=params,
-        base=kind,
-    )
+        pose = attach(above, above.kind.slots[slot], changed, orientation)
+    name = _read_id(item.get("id"), f"{place}.id") or f"{kind.name}{len(tree)}"
+    return Module(name, kind.name, parent, slot, orientation, rgb, *pose, changed, params, kind)
 
 
 def _read_type(
