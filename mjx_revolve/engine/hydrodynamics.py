@@ -186,12 +186,8 @@ def _immerse(world: World, parts: Parts, motion: BodyMotion, water: Water, wide:
     up, depth = matTvec(parts.rotation, normal), wide(below)
     law = find_buoyancy_law(parts.laws.buoyancy)
     submerged, moment = law.submersion(up, depth, parts.half_size)
-    passing = PartFlow(
-        matTvec(parts.rotation, relative),
-        matTvec(parts.rotation, motion.angular_velocity),
-        submerged,
-    )
-    return _Immersion(passing, stream, moment, up, depth)
+    v, w = (matTvec(parts.rotation, x) for x in (relative, motion.angular_velocity))
+    return _Immersion(PartFlow(v, w, submerged), stream, moment, up, depth)
 
 
 def _flow_at_the_beginning(parts: Parts, motion: BodyMotion, flow: PartFlow) -> PartFlow:
@@ -326,13 +322,9 @@ def _pressure(
     # moving water [m/s²].
     moving = at.stream.acceleration
     gradient = gravity if moving is None else vadd(gravity, moving)
-    mass, first = displaced_water(
-        at.flow.submerged,
-        matvec(parts.rotation, at.moment),
-        parts.volume,
-        parts.center_position,
-        world.density,
-    )
+    moment = matvec(parts.rotation, at.moment)
+    box = parts.volume, parts.center_position, world.density
+    mass, first = displaced_water(at.flow.submerged, moment, *box)
     if not any(map(_differs_by_part, gradient)):
         mass, first = gather(mass), tuple(map(gather, first))
         return cross(first, gradient), vscale(mass, gradient)
@@ -345,14 +337,9 @@ def _surface_tension(world: World, parts: Parts, at: _Immersion, wide: Sum) -> t
     tension = world.surface_tension
     if tension is None or not find_buoyancy_law(parts.laws.buoyancy).lifts:
         return ZERO, ZERO
+    up, weight = tuple(map(wide, at.up)), world.density * world.gravity
     return surface_tension(
-        tuple(map(wide, at.up)),
-        at.depth,
-        parts.half_size,
-        tension.gamma,
-        world.density * world.gravity,
-        tension.contact_angle,
-        parts.exposed,
+        up, at.depth, parts.half_size, tension.gamma, weight, tension.contact_angle, parts.exposed
     )
 
 
@@ -560,13 +547,8 @@ def _body_drag(
     stream = _stream(world, water, motion, box.position)
     at = vadd(motion.velocity, cross(motion.angular_velocity, box.position))
     at = at if stream.velocity is None else vsub(at, stream.velocity)
-    force, torque = law.body_force(
-        matTvec(box.rotation, at),
-        matTvec(box.rotation, motion.angular_velocity),
-        box.size,
-        world.density,
-        world.viscosity,
-    )
+    v, w = (matTvec(box.rotation, x) for x in (at, motion.angular_velocity))
+    force, torque = law.body_force(v, w, box.size, world.density, world.viscosity)
     force = vscale(fraction, matvec(box.rotation, force))
     torque = vscale(fraction, matvec(box.rotation, torque))
     return vadd(torque, cross(box.position, force)), force

@@ -69,14 +69,9 @@ def _damping(matrix: Any, square: Vec, velocity: Vec) -> tuple[Any, ...]:
 
 def _force(flow: PartFlow, numbers: FossenNumbers, world: World) -> Drag:
     v, w, submerged, _ = flow
-    damping = scale_inertia(
-        submerged,
-        SpatialInertia(
-            _damping(numbers.angular, numbers.angular_quadratic, w),
-            numbers.cross,
-            _damping(numbers.linear, numbers.quadratic, v),
-        ),
-    )
+    angular = _damping(numbers.angular, numbers.angular_quadratic, w)
+    linear = _damping(numbers.linear, numbers.quadratic, v)
+    damping = scale_inertia(submerged, SpatialInertia(angular, numbers.cross, linear))
     torque, force = apply_inertia(damping, w, v)
     return Drag(tuple(map(neg, force)), tuple(map(neg, torque)), damping)
 
