@@ -155,14 +155,9 @@ def accelerate(
         motor, load, inertia = _at_hinges(
             world, level.hinges, angle, speed, target, dt, column[0][2], neg(bias[0][2])
         )
+        torque, coriolis = add(motor, load), _coriolis(turning(motion), speed)
         block, bias, joint = eliminate_joint(
-            block,
-            bias,
-            column,
-            inertia,
-            add(motor, load),
-            _coriolis(turning(motion), speed),
-            symmetric,
+            block, bias, column, inertia, torque, coriolis, symmetric
         )
         block, bias = to_parent(rotation, level.hinges.position, block, bias, symmetric)
         # Of a symmetric block it is the row of `joint`.

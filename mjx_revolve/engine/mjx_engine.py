@@ -184,14 +184,11 @@ class MjxEngine:
 
     def _thrust(self, state: MjxState, ctrl: jax.Array) -> tuple[Any, Any, Any]:
         """The thrusters' commands, thrusts and power."""
-        if not self.tree.thrusters.count:
+        thrusters, density = self.tree.thrusters, self.tree.world.density
+        if not thrusters.count:
             return state.command, (), 0.0
-        command, thrusts, pumped = run_thrusters(
-            self.tree.thrusters,
-            state.command,
-            ctrl[self.plant.num_hinges :],
-            self.tree.world.density,
-        )
+        ctrl = ctrl[self.plant.num_hinges :]
+        command, thrusts, pumped = run_thrusters(thrusters, state.command, ctrl, density)
         return command, thrusts, jnp.sum(pumped, 0)
 
     def observe(self, state: MjxState) -> tuple[Float[Array, "nq lanes"], Float[Array, "nv lanes"]]:

@@ -176,9 +176,8 @@ def actuate(tree: Tree, state: State, ctrl: jax.Array) -> tuple[Any, Any, Any, S
     targets = tree.split_rows(ctrl[:hinges])
     if not count:
         return targets, (), (), 0.0
-    command, thrusts, pumped = run_thrusters(
-        tree.thrusters, state.command, ctrl[hinges:], tree.world.density
-    )
+    given = tree.thrusters, state.command, ctrl[hinges:], tree.world.density
+    command, thrusts, pumped = run_thrusters(*given)
     return targets, command, thrusts, total(*[pumped[k] for k in range(count)])
 
 

@@ -121,11 +121,8 @@ def run_thrusters(
     # Folded by XLA, the selection would leave `ctrl` unused in its piece of the step: it aborts.
     every = isinstance(delayed, np.ndarray) and bool(delayed.all())
     acting = lagged if every else jnp.where(delayed, lagged, clipped)
-    push = dead_band_thrust(
-        acting,
-        *map(known, (thrusters.backward, thrusters.forward)),
-        *map(known, (thrusters.dead_low, thrusters.dead_high)),
-    )
+    curve = thrusters.backward, thrusters.forward, thrusters.dead_low, thrusters.dead_high
+    push = dead_band_thrust(acting, *map(known, curve))
     if thrusters.line is not None:
         commands, thrusts, is_line = thrusters.line
         line = interpolated_thrust(acting, *(list(map(known, x)) for x in (commands, thrusts)))

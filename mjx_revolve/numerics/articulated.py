@@ -111,12 +111,9 @@ def eliminate_joint(
     across = _square(less(block.across, column_a, scaled_l), False)
     other = less(block.back, column_l, scaled_a)
     back = transpose(across) if symmetric else _square(other, False)
-    left = Block(
-        _square(less(block.angular, column_a, scaled_a), symmetric),
-        across,
-        back,
-        _square(less(block.linear, column_l, scaled_l), symmetric),
-    )
+    angular = _square(less(block.angular, column_a, scaled_a), symmetric)
+    linear = _square(less(block.linear, column_l, scaled_l), symmetric)
+    left = Block(angular, across, back, linear)
     carried = apply_block(left, *coriolis)
     pushed = mul(inverse, rest)
     bias = (
