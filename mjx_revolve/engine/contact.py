@@ -159,11 +159,8 @@ def bed_forces(
     # What the damping acts on is the acceleration relative to the bed, not to the water.
     gust = vscale(world.timestep, matTvec(motion.axes, water.acceleration))
     gust_torque, gust_force = apply_inertia(damping, ZERO, gust)
-    return (
-        vsub(tuple(gather(x) for x in torque), gust_torque),
-        vsub(tuple(gather(x) for x in force), gust_force),
-        damping,
-    )
+    torque, force = (tuple(map(gather, x)) for x in (torque, force))
+    return vsub(torque, gust_torque), vsub(force, gust_force), damping
 
 
 def bed_normal_force(

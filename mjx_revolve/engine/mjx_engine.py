@@ -420,16 +420,9 @@ def _add_water(
     column = lambda x: tuple(x[:, i, None] for i in range(3))  # noqa: E731
     place = flow.data.xpos[jnp.asarray(tree.bodies[level])]
     midpoint = column(rate_ahead[:, :3]), column(rate_ahead[:, 3:])
-    motion = BodyMotion(
-        angular_velocity=column(rate[:, :3]),
-        velocity=column(rate[:, 3:]),
-        z_axis=column(axes[:, 2]),
-        height=place[:, 2, None],
-        x_axis=column(axes[:, 0]),
-        y_axis=column(axes[:, 1]),
-        xy=(place[:, 0, None], place[:, 1, None]),
-        midpoint=midpoint,
-    )
+    spin, velocity = column(rate[:, :3]), column(rate[:, 3:])
+    (*xy, height), (x, y, z) = column(place), (column(axes[:, i]) for i in range(3))
+    motion = BodyMotion(spin, velocity, z, height, x, y, tuple(xy), midpoint)
     upwards = flow.acceleration + jnp.array([0.0, 0.0, world.gravity], flow.qpos.dtype)
     gravity = column(jnp.einsum("bji,j->bi", axes, upwards))
     pushes = thrusts[:, None] if tree.thrusters.count else ()
