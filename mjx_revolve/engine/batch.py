@@ -844,13 +844,5 @@ def _wire(assembly: Assembly, row: np.ndarray, capacity: Capacity) -> Plant:
     for r, body in enumerate(assembly.morphologies):
         pairs = np.array(body.hinge_neighbours(), int).reshape(-1, 2)
         first[: len(pairs), r], second[: len(pairs), r] = row[pairs.T, r]
-    return replace(
-        capacity.plant,
-        low=low,
-        high=high,
-        place=place,
-        axis=axis,
-        source=source,
-        first=first,
-        second=second,
-    )
+    plant = replace(capacity.plant, low=low, high=high, place=place, axis=axis, source=source)
+    return replace(plant, first=first, second=second)

@@ -606,12 +606,8 @@ class _Contact:
         Sums are products with matrices of zeros and ones: XLA:CPU makes a slow loop of a scatter,
         and other backends add in any order.
         """
-        values = (
-            *frames.position,
-            *frames.velocity,
-            *frames.angular_velocity,
-            *sum(frames.axes, ()),
-        )
+        moving = *frames.position, *frames.velocity, *frames.angular_velocity
+        values = *moving, *sum(frames.axes, ())
         table = jnp.concatenate([x.reshape(-1) for x in values])
         each = jnp.arange(self.radius.size, dtype=jnp.int32)
         columns = self.radius.size * jnp.arange(len(values), dtype=jnp.int32)[:, None]

@@ -98,15 +98,10 @@ def _tree(robot: Robot, prescribed: np.ndarray) -> SingleTree:
     stiffness = _DRIVEN_INERTIA * rate**2
     course: dict[str, Any] = {
         "armature": _DRIVEN_INERTIA,
-        "damping": 0.0,
-        "gain": stiffness,
-        "stiffness": stiffness,
-        "implicit_stiffness": 0.0,
         "servo_damping": 2 * _DRIVEN_INERTIA * rate,
-        "effort": (-NO_LIMIT, NO_LIMIT),
-        "target": (-NO_LIMIT, NO_LIMIT),
-        "range": (-NO_LIMIT, NO_LIMIT),
-        "stop": 0.0,
+        **dict.fromkeys(("gain", "stiffness"), stiffness),
+        **dict.fromkeys(("damping", "implicit_stiffness", "stop"), 0.0),
+        **dict.fromkeys(("effort", "target", "range"), (-NO_LIMIT, NO_LIMIT)),
         "motor": (NO_LIMIT, 0.0, 1.0),
     }
     below, done = [], 0
