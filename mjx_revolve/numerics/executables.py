@@ -117,13 +117,8 @@ def _keep(path: Path, made: Any) -> None:
 
 def _modes() -> tuple[Any, bool]:
     """What may change within a process, and a program with it."""
-    config: Any = jax.config
-    modes = (
-        config.jax_enable_x64,
-        config.jax_default_matmul_precision,
-        config.jax_threefry_partitionable,
-    )
-    return modes, fuses()
+    names = "jax_enable_x64", "jax_default_matmul_precision", "jax_threefry_partitionable"
+    return tuple(getattr(jax.config, name) for name in names), fuses()
 
 
 def _load(path: Path, tree: PyTree) -> Any:
