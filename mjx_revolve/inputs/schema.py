@@ -187,9 +187,7 @@ def checked(kind: type[T]) -> type[T]:
     return made
 
 
-@functools.cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(kind)
+_adapter = functools.cache(TypeAdapter)
 
 
 def read(kind: object, value: object, place: str = "", context: object = None) -> Any:

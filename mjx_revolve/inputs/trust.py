@@ -14,6 +14,7 @@ import hashlib
 import logging
 import os
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -151,11 +152,7 @@ def _remember(path: Path, kind: Kind, content: bytes) -> None:
     record = record_path()
     try:
         record.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        with open(record, "a", encoding="ascii", opener=_private) as file:
+        with open(record, "a", encoding="ascii", opener=partial(os.open, mode=0o600)) as file:
             file.write(f"{_digest(kind, content)}\n")
     except OSError as error:  # a read-only home: --trust is needed again
         _log.warning("not recorded that you use %s: %s", path, error.strerror)
-
-
-def _private(name: str, flags: int) -> int:
-    return os.open(name, flags, 0o600)

@@ -124,15 +124,11 @@ def _construct_int(loader: SafeLoader, node: yaml.ScalarNode) -> int:
     return value
 
 
-def _refuse_tag(loader: SafeLoader, node: yaml.Node) -> None:
-    loader.construct_undefined(node)
-
-
 SafeLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _construct_mapping)
 SafeLoader.add_constructor("tag:yaml.org,2002:int", _construct_int)
 SafeLoader.add_constructor("tag:yaml.org,2002:float", _construct_float)
 for _name in ("binary", "omap", "pairs", "set"):  # bytes, tuples and sets: no file of ours has any
-    SafeLoader.add_constructor(f"tag:yaml.org,2002:{_name}", _refuse_tag)
+    del SafeLoader.yaml_constructors[f"tag:yaml.org,2002:{_name}"]
 
 
 def check_size(data: object) -> None:
@@ -145,10 +141,8 @@ def check_size(data: object) -> None:
             raise _too_deep()
         if count > _MAX_NODES:
             raise InputError(f"expected at most {_MAX_NODES} values; found more (aliases?)")
-        if isinstance(item, dict):
-            stack.extend((value, depth + 1) for value in item.values())
-        elif isinstance(item, list):
-            stack.extend((value, depth + 1) for value in item)
+        inner = item.values() if isinstance(item, dict) else item if isinstance(item, list) else ()
+        stack.extend((value, depth + 1) for value in inner)
 
 
 def load_yaml(path: str | Path) -> Any:
