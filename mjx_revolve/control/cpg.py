@@ -78,6 +78,16 @@ def make_cpg(body: Plant | Robot, max_frequency: float = 2.0, amplitude: float =
     return make_controller(made_for, blocks.genes, decode, init, step)
 
 
+def system_matrix(w: jax.Array, coupling: NeighbourMatrix) -> jax.Array:
+    """`[2 n, 2 n, lanes]` rates of change of n oscillators, all x and then all y [rad/s]."""
+    rows = w.shape[0]
+    each = np.arange(rows)
+    matrix = jnp.zeros((2 * rows, 2 * rows, *w.shape[1:]), w.dtype)
+    for j, column in coupling.items():
+        matrix = matrix.at[:rows, j].set(column)
+    return matrix.at[each, rows + each].set(w).at[rows + each, each].set(-w)
+
+
 def _propagator(
     w: jax.Array, coupling: NeighbourMatrix, dt: float, fastest: float
 ) -> NeighbourMatrix:
@@ -99,13 +109,8 @@ def _propagator(
     rows = w.shape[0]
     if not rows:
         return {}
-    each = np.arange(rows)
-    matrix = jnp.zeros((2 * rows, 2 * rows, *w.shape[1:]), w.dtype)
-    for j, column in coupling.items():
-        matrix = matrix.at[:rows, j].set(column)
-    matrix = matrix.at[each, rows + each].set(w).at[rows + each, each].set(-w)
     halvings = max(0, math.ceil(math.log2(2 * dt * fastest)))
-    matrix = dt / 2**halvings * matrix
+    matrix = dt / 2**halvings * system_matrix(w, coupling)
 
     def times(a: jax.Array, b: jax.Array) -> jax.Array:
         return jnp.einsum("ij...,jk...->ik...", a, b, precision="highest")

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mjx_revolve.control.cpg import system_matrix
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.inputs.errors import InputError
@@ -85,11 +86,7 @@ def _sine_waves(parameters: Any, hinges: int) -> _Waves:
 def _cpg_waves(parameters: Any, hinges: int) -> _Waves:
     """Angular frequency, amplitude and phase of the largest sine of each oscillator."""
     w, coupling, reach, *_ = parameters
-    matrix = np.zeros((2 * hinges, 2 * hinges))
-    for j, column in coupling.items():
-        matrix[:hinges, j] = np.asarray(column, float)[:, 0]
-    rates = np.asarray(w, float)[:, 0]
-    matrix[:hinges, hinges:], matrix[hinges:, :hinges] = np.diag(rates), -np.diag(rates)
+    matrix = np.asarray(system_matrix(w, coupling), float)[..., 0]
     # The matrix M is antisymmetric, so i M is Hermitian and (x, y) = Σ V exp(-i λ t) V* (0, 1).
     turns, modes = np.linalg.eigh(1j * matrix)
     start = np.concatenate([np.zeros(hinges), np.ones(hinges)])

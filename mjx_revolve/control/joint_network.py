@@ -129,10 +129,8 @@ def make_joint_network(
             target = jnp.concatenate(wide, 1)
         place = _places(plant, genes)
         base = sum(layer[:, k, None] * place[k] for k in range(fixed))
-        late = phase[0, None] * place[1]
-        for k in range(1, 4):
-            late = late + phase[k, None] * place[k + 1]
-        sine, cosine = sincos(late)
+        late = [phase[k, None] * place[k + 1] for k in range(4)]
+        sine, cosine = sincos(sum(late[1:], late[0]))
         return (
             (base, layer[:, fixed:], back, pace, target, out[:, 1:]),
             (rate, sine, cosine),
@@ -142,8 +140,8 @@ def make_joint_network(
         )
 
     def init(parameters: PyTree) -> PyTree:
-        (base, *_), _, _, _, _ = parameters
-        rows = parameters[4].shape[0]
+        (base, *_), *_, number = parameters
+        rows = number.shape[0]
         like = base[0][:rows]
         sent = tuple(jnp.zeros_like(like) for _ in range(messages)) if rows else ()
         return observer.init(like), sent, jnp.zeros_like(base) if recurrent else ()

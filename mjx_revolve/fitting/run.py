@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -280,7 +281,7 @@ class FitRun:
         self.model = linearize(self.problem, self.state.point, self.state.steps)
         total = self.problem.settings.iterations
         progress = _Progress(self.state.iteration, total, unit="iteration")
-        try:
+        with contextlib.closing(progress):
             while not is_done(self.problem, self.state):
                 if interrupts.signal:
                     return None
@@ -295,8 +296,6 @@ class FitRun:
                     self.save()
                 progress.show(row)
             progress.say("predicting, and looking for what would help most")
-        finally:
-            progress.close()
         return conclude(self.problem, self.state, self.model, self.request.free, advise=True)
 
     def write(self, fit: Fit, page: str) -> None:

@@ -313,12 +313,8 @@ def _draw(scene: Scene, whole: Scene, view: np.ndarray) -> str:
     # The core's axes in the emptiest corner.
     length, room = 24.0, 34
     corners = [(x, y) for x in (room, picture.width - room) for y in (picture.height - room, room)]
-
-    def covered(at: tuple[int, int]) -> float:
-        x, y = at
-        return float(image[y - room : y + room, x - room : x + room, 3].sum())
-
-    corner = np.array(min(corners, key=covered), float)
+    covered = [image[y - room : y + room, x - room : x + room, 3].sum() for x, y in corners]
+    corner = np.array(corners[int(np.argmin(covered))], float)
     for k, name in enumerate(_AXES):
         way = view[:2, k] * (1, -1)
         tip = corner + length * way

@@ -152,9 +152,9 @@ def mount_piece(robot: Robot, piece: Piece) -> tuple[int, np.ndarray, np.ndarray
     fluid = robot.fluid
     k = int(np.flatnonzero(fluid.module == piece.module)[piece.part])
     part = robot.morphology.modules[piece.module].kind.parts[piece.part]
-    # The table has the centre of the part's main box.
-    center = np.asarray(part.position) + np.asarray(part.boxes[0].position)
-    return int(fluid.body[k]), fluid.position[k] - fluid.rotation[k] @ center, fluid.rotation[k]
+    # The table has the centre of the part's main box, which is the part's own.
+    place = fluid.position[k] - fluid.rotation[k] @ np.asarray(part.position)
+    return int(fluid.body[k]), place, fluid.rotation[k]
 
 
 def place_pieces(pieces: Sequence[Piece], frames: Iterable[tuple[np.ndarray, np.ndarray]]) -> Scene:

@@ -64,23 +64,14 @@ class ReplayRobot:
             found = f"{self.appears:g} to {end:g} s"
             raise InputError(f"robot {self.name!r}", "a finite end after its start", found)
 
-    def poses_at(self, time: np.ndarray, leap: float | None = None) -> np.ndarray:
-        """Poses `[F, nq]` at times `[F]` [s].
-
-        Args:
-            time: of the poses [s]; before the first and after the last pose that one is held.
-            leap: a robot that is farther than this from its pose before was put there, and holds
-                the pose until then [m]; None: never.
-        """
-        return interpolate_poses(np.asarray(self.time, float), self.qpos, time, leap)
-
 
 def interpolate_poses(
     rows: np.ndarray, qpos: ArrayLike, time: np.ndarray, leap: float | None = None
 ) -> np.ndarray:
     """Poses `[F, nq]` at times `[F]` between poses `qpos` `[T, nq]` at times `rows` `[T]`.
 
-    See `ReplayRobot.poses_at`.
+    Before the first and after the last of them, that one is held. A robot that is farther than
+    `leap` [m] from its pose before was put there, and holds the pose until then; None: never.
     """
     qpos = np.array(qpos, float)
     qpos[:, 3:7] = continuous_quaternions(qpos[:, 3:7])
@@ -119,7 +110,7 @@ class Recording:
         start: from when on it is shown [s].
         end: until when [s].
         marks: places to show.
-        leap: see `ReplayRobot.poses_at`.
+        leap: see `interpolate_poses`.
     """
 
     title: str

@@ -188,16 +188,17 @@ def make_colony_film(
     time = begin + np.arange(max(1, round((end - begin) * fps))) / fps
     starts = np.array([one.appears for one in recording.robots])
     ends = np.array([np.inf if one.end is None else one.end for one in recording.robots])
+    alive = (time >= starts[:, None]) & (time < ends[:, None])
     robots = tuple(
-        FilmRobot(one.robot, one.poses_at(time, recording.leap), (time >= start) & (time < stop))
-        for one, start, stop in zip(recording.robots, starts, ends, strict=True)
+        FilmRobot(one.robot, interpolate_poses(one.time, one.qpos, time, recording.leap), own)
+        for one, own in zip(recording.robots, alive, strict=True)
     )
     world = robots[0].robot.world
     water = water_at(world, np.zeros(len(time), int), time, 1)  # the same at any time
     shots = plan_circle(
         time,
         np.stack([one.qpos[:, :3] for one in robots]),
-        np.stack([one.alive for one in robots]),
+        alive,
         reach=max(one.robot.morphology.length for one in robots) / 2,
         aspect=size[0] / size[1],
         surface=world.surface_height,
