@@ -58,21 +58,16 @@ def _parser() -> argparse.ArgumentParser:
         examples=("export runs/mine", "export spider --mjcf spider.xml"),
     )
     add_episode_arguments(parser)
+    add = parser.add_argument
     for name, (_, endings, words) in _FORMATS.items():
-        parser.add_argument(f"--{name}", metavar=f"FILE{endings[0]}", help=words)
-    parser.add_argument(
-        "--out",
-        type=read_path,
-        metavar="DIR",
+        add(f"--{name}", metavar=f"FILE{endings[0]}", help=words)
+    add("--out", type=read_path, metavar="DIR",
         help="all formats into this folder (default: export in the run folder, individuals/N there "
         "of an individual, made anew each time, or MORPHOLOGY_export here, if there is none yet)",
-    )
-    parser.add_argument(
-        "--meshes",
-        metavar="PREFIX",
+    )  # fmt: skip
+    add("--meshes", metavar="PREFIX",
         help="what URDF and SDF put before the names of mesh files, such as "
-        "package://my_robot/meshes/ (default: meshes/, beside them)",
-    )
+        "package://my_robot/meshes/ (default: meshes/, beside them)")  # fmt: skip
     return parser
 
 

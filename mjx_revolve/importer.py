@@ -39,13 +39,11 @@ def main(argv: list[str] | None = None) -> int:
         "volumes and hinges. What cannot be taken over is listed.",
         examples=("import robot.urdf --out robots",),
     )
-    parser.add_argument("file", type=read_path, help="URDF or MJCF")
-    parser.add_argument(
-        "--out",
-        type=read_path,
-        metavar="DIR",
+    add = parser.add_argument
+    add("file", type=read_path, help="URDF or MJCF")
+    add("--out", type=read_path, metavar="DIR",
         help="folder; files of these names in it are replaced (default: here, where none is)",
-    )
+    )  # fmt: skip
     arguments = parser.parse_args(argv)
     read_file(arguments.file, 1)  # it is there
     check_output_folder(arguments.out or ".", "--out" if arguments.out else "")

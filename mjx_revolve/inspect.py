@@ -42,12 +42,8 @@ def main(argv: list[str] | None = None) -> int:
     add = parser.add_argument
     add("file", type=read_path, help="morphology YAML")
     add("--picture", type=read_path, metavar="OUT.png", help="draw it as well")
-    add(
-        "--density",
-        type=positive("kg/m3"),
-        default=_DENSITY,
-        help="of the water, kg/m³ (default %(default)s)",
-    )
+    add("--density", type=positive("kg/m3"), default=_DENSITY,
+        help="of the water, kg/m³ (default %(default)s)")  # fmt: skip
     add("--gravity", type=positive("m/s2"), default=_GRAVITY, help="m/s² (default %(default)s)")
     add("--modules", type=read_path, metavar="MY.yaml", help="module types of your own")
     add("--allow-overlap", action="store_true", help="accept modules that reach into each other")

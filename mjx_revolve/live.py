@@ -53,21 +53,16 @@ def main(argv: list[str] | None = None) -> int:
             "live spider gecko --world lake --robots 4",
         ),
     )
-    parser.add_argument(
-        "paths", nargs="*", type=read_path, metavar="RUN|CONFIG|MORPHOLOGY",
+    add = parser.add_argument
+    add("paths", nargs="*", type=read_path, metavar="RUN|CONFIG|MORPHOLOGY",
         help="robots that may be dropped, the first of them at once: run folders, configurations, "
         "morphologies, or shipped ones' names; the first run or configuration says how robots are "
-        "controlled, and where (default: lake_swim's)",
-    )  # fmt: skip
-    parser.add_argument("--world", type=read_world, help="another world: a name or a YAML")
-    parser.add_argument(
-        "--port", type=whole(0, 65535), default=0, metavar="N",
-        help="of the page on 127.0.0.1 (default: any that is free)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--robots", type=whole(1, 64), default=_MAX_ROBOTS, metavar="N",
-        help="for how many there is room; more are slower (default: %(default)s)",
-    )  # fmt: skip
+        "controlled, and where (default: lake_swim's)")  # fmt: skip
+    add("--world", type=read_world, help="another world: a name or a YAML")
+    add("--port", type=whole(0, 65535), default=0, metavar="N",
+        help="of the page on 127.0.0.1 (default: any that is free)")  # fmt: skip
+    add("--robots", type=whole(1, 64), default=_MAX_ROBOTS, metavar="N",
+        help="for how many there is room; more are slower (default: %(default)s)")  # fmt: skip
     add_trust_argument(parser)
     arguments = parser.parse_args(argv)
     prepare_process()

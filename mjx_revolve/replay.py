@@ -59,38 +59,20 @@ def _parser() -> Parser:
         ),
     )
     add_episode_arguments(parser)
-    parser.add_argument(
-        "--out",
-        type=read_path,
-        metavar="DIR_OR_FILE",
+    add = parser.add_argument
+    add("--out", type=read_path, metavar="DIR_OR_FILE",
         help="a folder for all three, or one file that ends in .mp4, .gif or .html (default: the "
         "run folder, made anew each time, or files of the morphology's name in the current folder, "
-        "where none is replaced)",
-    )
-    parser.add_argument(
-        "--size",
-        type=_size,
-        metavar="WIDTHxHEIGHT",
-        help="of the film [pixels], both even (default: 640x480, of a colony 960x540)",
-    )
-    parser.add_argument(
-        "--fps",
-        type=whole(1, _MOST_FPS),
-        default=30,
-        metavar="N",
-        help="frames per second (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--ancestors",
-        type=whole(1, _MOST_ANCESTORS),
-        metavar="N",
+        "where none is replaced)")  # fmt: skip
+    add("--size", type=_size, metavar="WIDTHxHEIGHT",
+        help="of the film [pixels], both even (default: 640x480, of a colony 960x540)")  # fmt: skip
+    add("--fps", type=whole(1, _MOST_FPS), default=30, metavar="N",
+        help="frames per second (default: %(default)s)")  # fmt: skip
+    add("--ancestors", type=whole(1, _MOST_ANCESTORS), metavar="N",
         help="a film, ancestors.mp4, of so many ancestors and the champion, or the individual, one "
-        "after the other, the oldest first",
-    )
+        "after the other, the oldest first")  # fmt: skip
     add_colony_arguments(parser)
-    parser.add_argument(
-        "--html", action="store_true", help="only the page for a browser; needs no OpenGL"
-    )
+    add("--html", action="store_true", help="only the page for a browser; needs no OpenGL")
     return parser
 
 

@@ -29,22 +29,19 @@ def _parser() -> argparse.ArgumentParser:
             "report runs/a runs/b --out both.html",
         ),
     )
-    parser.add_argument("runs", nargs="+", type=read_path, metavar="RUN",
-                        help="a run folder; or the folder of one sweep")  # fmt: skip
-    parser.add_argument(
-        "--out", type=read_path, metavar="FILE.html",
+    add = parser.add_argument
+    add("runs", nargs="+", type=read_path, metavar="RUN",
+        help="a run folder; or the folder of one sweep")  # fmt: skip
+    add("--out", type=read_path, metavar="FILE.html",
         help="the page (default: report.html in a run's or sweep's folder; of several runs, here)",
     )  # fmt: skip
-    parser.add_argument(
-        "--every-champion", action="store_true",
+    add("--every-champion", action="store_true",
         help="show each run's champion in full, not only the best of each configuration",
     )  # fmt: skip
-    parser.add_argument(
-        "--individuals", type=_read_individuals, metavar="NUMBERS",
+    add("--individuals", type=_read_individuals, metavar="NUMBERS",
         help="where bodies evolve: pages on which individuals swim, RUN/individuals/N.html, with "
         "links from the report: best (of the last generation, and the champion's family), archive "
-        "(all in it), or numbers such as 17,42; a minute or two",
-    )  # fmt: skip
+        "(all in it), or numbers such as 17,42; a minute or two")  # fmt: skip
     add_trust_argument(parser)
     return parser
 

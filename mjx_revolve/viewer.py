@@ -55,13 +55,11 @@ def main(argv: list[str] | None = None) -> int:
     )
     add_episode_arguments(parser)
     parser.add_argument(
-        "--out",
-        type=read_path,
-        metavar="FILE.html",
+        "--out", type=read_path, metavar="FILE.html",
         help="default: viewer.html in the run folder (of an individual, individuals/N.html there; "
         "with --colony, colony.html), made anew each time; or the morphology's name in the current "
         "folder, where no file is replaced",
-    )
+    )  # fmt: skip
     add_colony_arguments(parser)
     arguments = parser.parse_args(argv)
     if arguments.out is not None:

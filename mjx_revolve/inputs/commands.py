@@ -144,14 +144,11 @@ read_seed = whole(0, _SEEDS - 1)
 
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the options of commands that evolve: `--workers` and `--cluster`."""
-    parser.add_argument(
-        "--workers", type=whole(1), metavar="N",
-        help="processes on this machine (default: its cores)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--cluster", type=refuse_blank, metavar="SCHEDULER",
-        help="a Dask scheduler's address, or its scheduler file: its workers score",
-    )  # fmt: skip
+    add = parser.add_argument
+    add("--workers", type=whole(1), metavar="N",
+        help="processes on this machine (default: its cores)")  # fmt: skip
+    add("--cluster", type=refuse_blank, metavar="SCHEDULER",
+        help="a Dask scheduler's address, or its scheduler file: its workers score")  # fmt: skip
 
 
 def check_run_arguments(arguments: argparse.Namespace) -> None:
@@ -162,24 +159,16 @@ def check_run_arguments(arguments: argparse.Namespace) -> None:
 
 def add_episode_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of `load_episode`: path, duration, seed, individual, world, modules."""
-    parser.add_argument(
-        "path", type=read_path, help="run folder, genes.yaml, or morphology (YAML or name)"
-    )
-    parser.add_argument(
-        "--duration", type=read_seconds, metavar="S", help="seconds (default: the task's, or 10)"
-    )
-    parser.add_argument("--seed", type=read_seed, metavar="N", help="draws another start")
-    parser.add_argument(
-        "--individual", type=whole(0), metavar="N",
+    add = parser.add_argument
+    add("path", type=read_path, help="run folder, genes.yaml, or morphology (YAML or name)")
+    add("--duration", type=read_seconds, metavar="S", help="seconds (default: the task's, or 10)")
+    add("--seed", type=read_seed, metavar="N", help="draws another start")
+    add("--individual", type=whole(0), metavar="N",
         help="number of an individual of the run, where bodies evolve (default: the champion)",
     )  # fmt: skip
-    parser.add_argument(
-        "--world", type=read_world, help="of a morphology: a name or a YAML (default: lake)"
-    )
-    parser.add_argument(
-        "--modules", type=read_path, metavar="MY.yaml",
-        help="of a morphology: module types of your own (a run's are in its folder)",
-    )  # fmt: skip
+    add("--world", type=read_world, help="of a morphology: a name or a YAML (default: lake)")
+    add("--modules", type=read_path, metavar="MY.yaml",
+        help="of a morphology: module types of your own (a run's are in its folder)")  # fmt: skip
     parser.set_defaults(colony=False)
     add_trust_argument(parser)
 
