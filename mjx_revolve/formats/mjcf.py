@@ -108,26 +108,24 @@ def _show_meshes(robot: Robot, spec: mujoco.MjSpec, links: tuple[Link, ...]) -> 
             userface=np.asarray(mesh.faces, np.int32).ravel(),
             inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
         )
-    taken = {geom.name for geom in spec.geoms}
-    for link in links:
-        body = spec.body(robot.mj_model.body(link.body).name)
-        for part in link.parts:
-            seen = unique_names([f"{part.name}/mesh"], taken)[0]
-            taken.add(seen)
-            for name in part.geoms:
-                spec.geom(name).group = _HIDDEN
-            body.add_geom(
-                name=seen,
-                type=mujoco.mjtGeom.mjGEOM_MESH,
-                meshname=part.mesh,
-                pos=part.position,
-                quat=matrix_to_quat(part.rotation),
-                mass=0.0,
-                rgba=[*part.rgb, 1.0],
-                contype=0,
-                conaffinity=0,
-                group=_SEEN,
-            )
+    parts = [(link.body, part) for link in links for part in link.parts]
+    names = [f"{part.name}/mesh" for _, part in parts]
+    names = unique_names(names, taken={geom.name for geom in spec.geoms})
+    for (body, part), seen in zip(parts, names, strict=True):
+        for name in part.geoms:
+            spec.geom(name).group = _HIDDEN
+        spec.body(robot.mj_model.body(body).name).add_geom(
+            name=seen,
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=part.mesh,
+            pos=part.position,
+            quat=matrix_to_quat(part.rotation),
+            mass=0.0,
+            rgba=[*part.rgb, 1.0],
+            contype=0,
+            conaffinity=0,
+            group=_SEEN,
+        )
 
 
 def _light(robot: Robot, spec: mujoco.MjSpec) -> None:
@@ -170,13 +168,13 @@ def _lift(robot: Robot, spec: mujoco.MjSpec) -> None:
     """Adds bodies at the centres of buoyancy, since MuJoCo lifts at centres of mass only."""
     world, table, model, floats = robot.world, robot.fluid, robot.mj_model, _floats(robot)
     center = table.position + np.einsum("pij,pj->pi", table.rotation, table.center_of_volume)
-    taken = {body.name for body in spec.bodies}
-    for body in np.unique(table.body[floats]):
-        rows = floats & (table.body == body)
+    bodies = [model.body(body) for body in np.unique(table.body[floats])]
+    names = [f"{body.name}/lift" for body in bodies]
+    names = unique_names(names, taken={body.name for body in spec.bodies})
+    for body, name in zip(bodies, names, strict=True):
+        rows = floats & (table.body == body.id)
         volume = table.volume[rows]
-        name = unique_names([f"{model.body(body).name}/lift"], taken)[0]
-        taken.add(name)
-        spec.body(model.body(body).name).add_body(
+        spec.body(body.name).add_body(
             name=name,
             pos=volume @ center[rows] / volume.sum(),
             explicitinertial=True,

@@ -84,8 +84,7 @@ def pick_rows(robot: Robot, trajectory: Trajectory) -> tuple[np.ndarray, np.ndar
         InputError: not one row is finite.
     """
     timestep = robot.world.timestep
-    finite = np.isfinite(np.asarray(trajectory.qpos)).all(-1)
-    finite &= np.isfinite(np.asarray(trajectory.qvel)).all(-1)
+    finite = np.isfinite(np.hstack([trajectory.qpos, trajectory.qvel])).all(-1)
     count = len(finite) if finite.all() else int(finite.argmin())
     if count == 0:
         raise InputError("rollout", "finite poses", "none")

@@ -87,14 +87,8 @@ def make_sdf(robot: Robot, meshes: str = "meshes/", start: np.ndarray | None = N
         *(one for link in links for one in _link(robot, links, link, meshes)),
         *(_hinge(robot, link, links[link.parent]) for link in links[1:]),
         *(one for link in links for one in _forces(robot, link)),
-        _plugin("joint-state-publisher", "JointStatePublisher"),
-        _plugin(
-            "odometry-publisher",
-            "OdometryPublisher",
-            odom_frame="odom",
-            robot_base_frame=BASE,
-            dimensions=3,
-        ),
+        _plugin("joint-state-publisher"),
+        _plugin("odometry-publisher", odom_frame="odom", robot_base_frame=BASE, dimensions=3),
         name=name,
         canonical_link=_root(robot, links[0]).name,
     )
@@ -115,9 +109,9 @@ def _pose(position: Iterable[float], rotation: np.ndarray, **relative_to: str) -
     return node("pose", [*position, *roll_pitch_yaw(rotation)], **relative_to)
 
 
-def _plugin(file: str, kind: str, *content: Element, **fields: Value) -> Element:
-    """A gz-sim system; its fields in the order given."""
-    name = f"gz::sim::systems::{kind}"
+def _plugin(file: str, *content: Element, **fields: Value) -> Element:
+    """A gz-sim system, such as "lift-drag", LiftDrag; its fields in the order given."""
+    name = f"gz::sim::systems::{file.title().replace('-', '')}"
     return node("plugin", *content, *nodes(**fields), filename=f"gz-sim-{file}-system", name=name)
 
 
@@ -143,13 +137,13 @@ def _surroundings(robot: Robot) -> Iterator[Element]:
     physics = nodes(max_step_size=_STEP, real_time_factor=1)
     yield node("physics", *physics, name="water", type="dart")
     yield node("gravity", [0, 0, -world.gravity])
-    yield _plugin("physics", "Physics")
-    yield _plugin("user-commands", "UserCommands")
-    yield _plugin("scene-broadcaster", "SceneBroadcaster")
+    yield _plugin("physics")
+    yield _plugin("user-commands")
+    yield _plugin("scene-broadcaster")
     if _floats(robot):
         surface = nodes(above_depth=world.surface_height, density=0)
         graded = [node("default_density", world.density), node("density_change", *surface)]
-        yield _plugin("buoyancy", "Buoyancy", node("graded_buoyancy", *graded))
+        yield _plugin("buoyancy", node("graded_buoyancy", *graded))
     colors = nodes(ambient=[0.5, 0.6, 0.65, 1], background=[0.25, 0.5, 0.6, 1], grid=False)
     yield node("scene", *colors)
     yield node(
@@ -303,7 +297,6 @@ def _forces(robot: Robot, link: Link) -> Iterator[Element]:
     if link.joint is not None:
         yield _plugin(
             "joint-position-controller",
-            "JointPositionController",
             joint_name=link.joint.name,
             p_gain=link.joint.stiffness,
             i_gain=0,
@@ -337,7 +330,6 @@ def _damping(
         tags |= {rows[i] + axes[j]: linear[i, j] for i, j in np.argwhere(linear)}
     return _plugin(
         "hydrodynamics",
-        "Hydrodynamics",
         link_name=part.name,
         water_density=robot.world.density,
         default_current=robot.world.current,
@@ -351,7 +343,6 @@ def _lift_drag(robot: Robot, part: PlacedPart) -> Element:
     names = ("a0", "cla", "cda", "cma", "alpha_stall", "cla_stall", "cda_stall", "cma_stall")
     return _plugin(
         "lift-drag",
-        "LiftDrag",
         link_name=part.name,
         air_density=float(plate.density),
         area=plate.area,
@@ -376,7 +367,6 @@ def _thruster(robot: Robot, part: PlacedPart) -> Element:
     coefficient = _THRUST_COEFFICIENT / (2 * np.pi) ** 2
     return _plugin(
         "thruster",
-        "Thruster",
         joint_name=f"{part.name}_propeller_joint",
         fluid_density=robot.world.density,
         propeller_diameter=propeller(part.part)[1],

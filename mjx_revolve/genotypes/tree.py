@@ -183,19 +183,11 @@ def _delete(space: Space, rng: np.random.Generator, body: Morphology) -> Morphol
     return remove_module(body, pick(rng, leaves))
 
 
-def _prune(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology:
-    return remove_module(body, _drawn(rng, body))
-
-
 def _duplicate(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology | None:
     index = _drawn(rng, body)
     if body.num_modules + _size(body, index) > space.max_modules:
         return None
     return graft_subtree(body, *pick(rng, free_slots(body)), body, index)
-
-
-def _swap(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology:
-    return swap_subtrees(body, _drawn(rng, body), _drawn(rng, body))
 
 
 def _retype(space: Space, rng: np.random.Generator, body: Morphology) -> Morphology:
@@ -228,10 +220,10 @@ def _mirror(space: Space, rng: np.random.Generator, body: Morphology) -> Morphol
 _MUTATIONS: dict[str, Callable[[Space, np.random.Generator, Morphology], Morphology | None]] = {
     "add": _add,
     "delete": _delete,
-    "prune": _prune,
+    "prune": lambda _, rng, body: remove_module(body, _drawn(rng, body)),
     "duplicate": _duplicate,
     "mirror": _mirror,
-    "swap": _swap,
+    "swap": lambda _, rng, body: swap_subtrees(body, _drawn(rng, body), _drawn(rng, body)),
     "retype": _retype,
     "turn": _turn_one,
 }
