@@ -17,12 +17,13 @@ from mjx_revolve.engine.kinematics import mass_centers
 from mjx_revolve.episodes.tasks import body_length
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.short_repr import short_repr
-from mjx_revolve.view.surroundings import target_name, water_velocity
+from mjx_revolve.view.surroundings import target_at_last, target_name, water_velocity
 from mjx_revolve.water.flow import Water
 
 if TYPE_CHECKING:
     from mjx_revolve.engine.robot import Robot
     from mjx_revolve.episodes.config import TaskConfig
+    from mjx_revolve.episodes.fitness import Fitness
     from mjx_revolve.episodes.simulate import Trajectory
 
 # A robot that gets less far than this only drifted to and fro, and has no heading [body lengths].
@@ -189,6 +190,13 @@ def analyse_motion(
         cost=float(costs[-1]),
         costs=np.where(far & (np.arange(count) > first), costs, np.nan),
     )
+
+
+def replay_motion(fitness: Fitness, trajectory: Trajectory, key: jax.Array) -> Motion:
+    """The motion of an episode that a fitness has replayed, from the starts of a key."""
+    robot, task = fitness.robot, fitness.config.task
+    begin, target = counted_time(task, robot.world.timestep), target_at_last(task, trajectory)
+    return analyse_motion(robot, trajectory, begin, fitness.water(key), target, task)
 
 
 def counted_time(task: TaskConfig, timestep: float) -> float:

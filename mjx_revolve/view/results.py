@@ -17,11 +17,10 @@ from mjx_revolve.view.body_pictures import plot_best
 from mjx_revolve.view.colony_history import read_history
 from mjx_revolve.view.colony_pictures import plot_history
 from mjx_revolve.view.convergence import plot_colony, plot_fitness
-from mjx_revolve.view.motion import counted_time
+from mjx_revolve.view.motion import replay_motion
 from mjx_revolve.view.motion_plots import plot_trajectory
 from mjx_revolve.view.plots import figure_png, with_unit
-from mjx_revolve.view.surroundings import target_at_last
-from mjx_revolve.view.swim_picture import plot_swim
+from mjx_revolve.view.swim_picture import draw_motion
 
 
 def describe_score(champion: Champion, config: Config) -> str:
@@ -56,16 +55,13 @@ def save_pictures(run: Run, champion: Champion) -> None:
         figures["bodies.png"] = plot_best(folder.path, read_modules(config), title)
     if isinstance(fitness, Fitness):
         assert champion.key is not None  # it is evaluated
-        robot, trajectory = fitness.robot, fitness.replay(champion.genes, champion.key)
-        height = float(robot.world.surface_height)
+        trajectory = fitness.replay(champion.genes, champion.key)
+        height = float(fitness.robot.world.surface_height)
         figures["trajectory.png"] = plot_trajectory(trajectory, height, title)
         # In the first of the poses from which it was evaluated.
-        folder.write(
-            "champion/robot.xml", make_mjcf(robot, np.asarray(trajectory.qpos[0])).encode()
-        )
-        counted = counted_time(config.task, robot.world.timestep)
-        water, target = fitness.water(champion.key), target_at_last(config.task, trajectory)
-        figures["swim.png"] = plot_swim(robot, trajectory, counted, water, target, config.task)
+        model = make_mjcf(fitness.robot, np.asarray(trajectory.qpos[0]))
+        folder.write("champion/robot.xml", model.encode())
+        figures["swim.png"] = draw_motion(replay_motion(fitness, trajectory, champion.key))
     for name, figure in figures.items():
         folder.write(name, figure_png(figure))
 

@@ -12,10 +12,9 @@ from mjx_revolve.episodes.fitness import Fitness
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.inputs.errors import InputError
-from mjx_revolve.view.motion import Motion, analyse_motion, count_finite, counted_time
+from mjx_revolve.view.motion import Motion, count_finite, replay_motion
 from mjx_revolve.view.report.record import RunRecord, number
 from mjx_revolve.view.sensor_log import SensorTrace, trace_sensors
-from mjx_revolve.view.surroundings import target_at_last
 
 # A replay with a score further than this from the recorded mean counts as another episode: standard
 # deviations of single episodes, and a share of the score itself if those hardly differ.
@@ -66,11 +65,7 @@ def replay_champion(record: RunRecord, fitness: Fitness) -> ChampionReplay:
     if count < len(trajectory.qpos):
         record.note("changed", f"the replay blows up after {float(trajectory.time[count]):.3g} s")
     _compare(record, score)
-    begin = counted_time(fitness.config.task, fitness.robot.world.timestep)
-    motion = analyse_motion(
-        fitness.robot, trajectory, begin, fitness.water(key),
-        target_at_last(fitness.config.task, trajectory), fitness.config.task,
-    )  # fmt: skip
+    motion = replay_motion(fitness, trajectory, key)
     finite = jax.tree.map(lambda x: x[:count] if np.ndim(x) else x, trajectory)
     return ChampionReplay(motion, score, measures, trace_sensors(fitness, finite, key))
 
