@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_revolve.engine.plant import body_geometry
 from mjx_revolve.engine.robot import Robot
@@ -507,12 +508,16 @@ def _read_run(path: Path) -> dict[str, TimeSeries]:
     every = max(1, round(0.02 / robot.world.timestep))
     time = np.asarray(trajectory.time, float)[every - 1 :: every]
     qpos = np.asarray(trajectory.qpos, float)[every - 1 :: every]
-    ctrl = np.asarray(trajectory.ctrl, float)
-    names = [robot.mj_model.actuator(k).name for k in range(robot.mj_model.nu)]
-    begun = robot.world.timestep * np.arange(len(ctrl))
-    found = {f"command.{n}": TimeSeries(begun, x) for n, x in zip(names, ctrl.T, strict=True)}
     pose = zip(_POSE[:7], qpos.T[:7], strict=True)
-    return found | {name: TimeSeries(time, x) for name, x in pose}
+    return sent_commands(robot, trajectory.ctrl) | {name: TimeSeries(time, x) for name, x in pose}
+
+
+def sent_commands(robot: Robot, ctrl: ArrayLike) -> dict[str, TimeSeries]:
+    """Signals of commands `[T, nu]` in MuJoCo's order, a row for each step."""
+    names = [robot.mj_model.actuator(k).name for k in range(robot.mj_model.nu)]
+    rows = np.asarray(ctrl, float)
+    begun = robot.world.timestep * np.arange(len(rows))
+    return {f"command.{n}": TimeSeries(begun, x) for n, x in zip(names, rows.T, strict=True)}
 
 
 # --- checks ---------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.fitting.problem import FitSettings, make_problem
-from mjx_revolve.fitting.recording import RobotRecording, TimeSeries
+from mjx_revolve.fitting.recording import RobotRecording, TimeSeries, sent_commands
 from mjx_revolve.inputs.errors import InputError
 
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
@@ -47,11 +47,7 @@ def simulate_signals(
     time = dt * np.arange(count + 1)
     still = TimeSeries(time[[0, -1]], np.zeros(2))
     signals = dict.fromkeys(("x", "y", "z", "yaw", "roll", "pitch"), still)
-    commands = {}
-    if ctrl is not None:
-        for k in range(robot.mj_model.nu):
-            name = robot.mj_model.actuator(k).name
-            commands[f"command.{name}"] = TimeSeries(time[:-1], np.asarray(ctrl, float)[:, k])
+    commands = {} if ctrl is None else sent_commands(robot, ctrl)
     settings = FitSettings(window=float(time[-1]), held_out=0.0)
     whole = RobotRecording("simulated", signals | commands)
     problem = make_problem(robot, [whole], [*free, "current"], settings)

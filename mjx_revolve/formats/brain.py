@@ -182,9 +182,7 @@ def _lower(
 ) -> Brain:  # fmt: skip
     builder = Builder()
     start = tuple(np.asarray(x).reshape(-1) for x in jax.tree.leaves(initial))
-    state = []
-    for k, x in enumerate(start):
-        state.append(builder.input(f"state{k}", kind_of(x.dtype), x.size))
+    state = [builder.input(f"state{k}", kind_of(x.dtype), x.size) for k, x in enumerate(start)]
     time = builder.input("time", "real", 1)
     signals, leaves = [], {}
     for name, unit, words, parts in _list_readings(readings):
