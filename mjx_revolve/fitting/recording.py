@@ -94,7 +94,7 @@ class RobotRecording:
         return time, values
 
 
-def read_map(options: Sequence[str], label: str = "--map") -> dict[str, str]:
+def read_map(options: Sequence[str]) -> dict[str, str]:
     """The mapping of names to columns, from `NAME=COLUMN` texts and YAML files of them.
 
     Raises:
@@ -107,7 +107,7 @@ def read_map(options: Sequence[str], label: str = "--map") -> dict[str, str]:
             found[name.strip()] = source.strip()
             continue
         if not Path(option).is_file():
-            raise InputError(f"{label} {option}", "NAME=COLUMN, or a YAML file of them", "neither")
+            raise InputError(f"--map {option}", "NAME=COLUMN, or a YAML file of them", "neither")
         data = load_yaml(option)
         if not isinstance(data, dict):
             raise InputError(option, "a mapping of names to columns", show(data))

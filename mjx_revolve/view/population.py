@@ -6,21 +6,15 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from mjx_revolve.episodes.individual_log import LoggedIndividual, read_generations, read_individuals
+from mjx_revolve.view.colony_history import Lifespan
 
 Picked = TypeVar("Picked")
-
-
-class _HasParents(Protocol):
-    @property
-    def parents(self) -> tuple[int, ...]: ...
-
-
-Born = TypeVar("Born", bound=_HasParents)
+Born = TypeVar("Born", LoggedIndividual, Lifespan)
 
 
 @dataclass(frozen=True, eq=False)

@@ -306,18 +306,18 @@ def _convergence(groups: Sequence[RunGroup]) -> str:
             "below": "how far the search spreads" if record.population is None
             else "how full the archive is, or how large the living are",
             "band": "quartiles" if quartiles else "mean and standard deviation",
-            "fitness": svg_source(_plot_fitness(record, record.fitness)),
+            "fitness": svg_source(_plot_fitness(record)),
             "colony": record.history is not None,
         })  # fmt: skip
     return sections.convergence(comparisons, entries)
 
 
-def _plot_fitness(record: RunRecord, label: str) -> Figure:
+def _plot_fitness(record: RunRecord) -> Figure:
     """One run's fitness: over generations, or over a colony's time."""
     needed = ("time", "best", "median", "lower_quartile", "upper_quartile", "champion")
     if record.history is not None and all(name in record.metrics for name in needed):
         return convergence.plot_colony(record.metrics)
-    return convergence.plot_fitness(record.metrics, "", label)
+    return convergence.plot_fitness(record.metrics, "", record.fitness)
 
 
 def _side_by_side(groups: Sequence[RunGroup], replays: Mapping[Path, ChampionReplay]) -> str:
