@@ -100,9 +100,8 @@ def _named_files(arguments: argparse.Namespace) -> dict[str, Path]:
 def _check_importable(path: Path, label: str) -> None:
     """Refuses a file that the node beside it could not import."""
     if not path.stem.isidentifier() or keyword.iskeyword(path.stem):
-        raise InputError(
-            label, "a name that Python can import (letters, digits and _)", repr(path.stem)
-        )
+        wanted = "a name that Python can import (letters, digits and _)"
+        raise InputError(label, wanted, repr(path.stem))
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -97,9 +97,8 @@ def main(argv: list[str] | None = None) -> int:
                  "modules": a.modules, "seed": a.seed, "set": a.settings,
                  "free": a.free != _FREE}  # fmt: skip
         for name in (name for name, value in given.items() if value):
-            raise InputError(
-                "--resume", "--trust alone beside it, as the folder has all else", name
-            )
+            alone = "--trust alone beside it, as the folder has all else"
+            raise InputError("--resume", alone, name)
     if arguments.plan and (arguments.columns or arguments.out or arguments.seed):
         raise InputError("--plan", "neither --map, --out nor --seed", "one")
     if arguments.plan and arguments.recordings:

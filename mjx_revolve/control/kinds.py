@@ -137,9 +137,8 @@ def _check_users_controller(name: str, controller: object, plant: Plant) -> None
             if not hasattr(x, "ndim"):
                 raise InputError("init", "a state of arrays [..., lanes]", repr(x))
             if x.ndim and x.shape[-1] != lanes and jnp.issubdtype(x.dtype, jnp.floating):
-                raise InputError(
-                    "init", f"a state of arrays [..., lanes], here {lanes}", _shapes(x)
-                )
+                wide = f"a state of arrays [..., lanes], here {lanes}"
+                raise InputError("init", wide, _shapes(x))
         return state, *controller.step(parameters, state, time, sense)
 
     genes, time = jnp.zeros((count, lanes), jnp.float32), jnp.zeros((), jnp.float32)

@@ -104,10 +104,8 @@ def _as_list(neurons: object) -> Any:
         neurons = [{"id": k} | dict(x) if isinstance(x, Mapping) else x for k, x in own]
     if not isinstance(neurons, list):
         return neurons
-    is_input = [isinstance(x, Mapping) and x.get("layer") == "input" for x in neurons]
-    return [
-        {"type": "Input"} | dict(x) if own else x for x, own in zip(neurons, is_input, strict=True)
-    ]
+    is_input = lambda x: isinstance(x, Mapping) and x.get("layer") == "input"  # noqa: E731
+    return [{"type": "Input"} | dict(x) if is_input(x) else x for x in neurons]
 
 
 _OrNone = BeforeValidator(lambda value: value or ())

@@ -202,9 +202,8 @@ def from_arrays(arrays: Mapping[str, np.ndarray]) -> Archive:
     Raises:
         InputError: the arrays are no archive's.
     """
-    found: dict[str, Any] = {
-        field.name: np.asarray(arrays.get(field.name)) for field in fields(Archive)
-    }
+    known = [field.name for field in fields(Archive)]
+    found: dict[str, Any] = {name: np.asarray(arrays.get(name)) for name in known}
     count, axes = len(np.atleast_1d(found["ids"])), np.size(found["names"])
     both = {"centers": (count, axes), "points": (count, axes)}
     ends = dict.fromkeys(("names", "lows", "highs"), (axes,))

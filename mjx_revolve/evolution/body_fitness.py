@@ -241,9 +241,8 @@ def _ask_for_measures(config: Config) -> Config:
     """The configuration, with the measures of objectives and archive added to `task.measures`."""
     bodies = config.bodies
     assert bodies is not None
-    named = [
-        name.removeprefix("-") for name in (*bodies.selection.objectives, *bodies.selection.novelty)
-    ]
+    selection = bodies.selection
+    named = [name.removeprefix("-") for name in (*selection.objectives, *selection.novelty)]
     named += bodies.archive.axes if bodies.archive else ()
     extra = [name for name in named if name in MEASURES and MEASURES[name].record]
     wanted = tuple(dict.fromkeys((*config.task.measures, *extra)))

@@ -224,9 +224,8 @@ class PatternNetwork:
     def __init__(self, settings: BrainsConfig, common: Controller) -> None:
         """See `make_brain_encoding`."""
         self.settings, inputs = settings, 7
-        self.kinds = list(
-            dict.fromkeys((g.what, g.place) for g in common.genes if g.place != "robot")
-        )
+        kinds = [(gene.what, gene.place) for gene in common.genes if gene.place != "robot"]
+        self.kinds = list(dict.fromkeys(kinds))
         self.whole = [gene for gene in common.genes if gene.place == "robot"]
         self.shapes = (_HIDDEN, inputs), (len(self.kinds), _HIDDEN + inputs)
         # Ends of the weights of the first and of the second layer.

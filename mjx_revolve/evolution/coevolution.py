@@ -223,9 +223,8 @@ class BodyEvolution(IndividualEvolution, Evolution[BodySearch, _Proposal, list[I
         )
         scores = np.array([individual.score for individual in born])
         champion = found.elites[0].score if found.elites else float("-inf")
-        return Generation(
-            found, scores, champion, self._columns(found, scores), trials, found.trials
-        )
+        columns = self._columns(found, scores)
+        return Generation(found, scores, champion, columns, trials, found.trials)
 
     def _columns(self, search: BodySearch, scores: np.ndarray) -> dict[str, float]:
         best = search.offspring[int(np.nanargmax(scores))] if np.isfinite(scores).any() else None

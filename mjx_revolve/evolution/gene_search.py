@@ -207,10 +207,8 @@ class GeneEvolution(Evolution[GeneSearch, _Proposal, Scored]):
         def judge(k: int) -> Passport:
             return make_passport(self.executor.fitness, genes[k], self.config.seed)
 
-        required = self.config.passport == "required"
-        winner, found = choose_candidate(
-            score, eligible, self.config.seed, judge if required else None
-        )
+        required = judge if self.config.passport == "required" else None
+        winner, found = choose_candidate(score, eligible, self.config.seed, required)
         return Champion(genes=genes[winner], origin=candidates[winner][0], **found)
 
     # --- to and from a checkpoint

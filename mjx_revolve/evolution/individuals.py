@@ -187,9 +187,7 @@ def from_records(records: Any, fitness: BodyFitness) -> dict[int, Individual]:
 
 def state_to_arrays(search: Any, counters: Sequence[str], seed: int) -> dict[str, np.ndarray]:
     """A search's counters and its seed, which `reading_state` compares."""
-    return {name: np.asarray(getattr(search, name)) for name in counters} | {
-        "seed": np.asarray(seed)
-    }
+    return {name: np.asarray(getattr(search, name)) for name in counters} | {"seed": np.array(seed)}
 
 
 @contextlib.contextmanager

@@ -323,9 +323,7 @@ class Run:
 
     def _open_log(self) -> TensorBoardLog:
         table = self.folder.load_metrics() if self.generation else {}
-        rows = [
-            dict(zip(table, values, strict=True)) for values in zip(*table.values(), strict=True)
-        ]
+        rows = [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
         return TensorBoardLog(self.folder.path / "tensorboard", self.generation, rows)
 
     def save(self) -> None:

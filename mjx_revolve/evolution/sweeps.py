@@ -371,10 +371,8 @@ def _run(
             print(f"resuming {plan.name} {run.resumption}", file=out, flush=True)
         else:
             with opening_config(plan.base, trust):
-                place = str(folder)
-                run = Run.begin(
-                    str(plan.base), plan.overrides, place, executors, interrupts.writing
-                )
+                base, place = str(plan.base), str(folder)
+                run = Run.begin(base, plan.overrides, place, executors, interrupts.writing)
             print(f"beginning {plan.name}", file=out, flush=True)
         opened.callback(run.close)
         champion = run.evolve(interrupts, draw, out, label)

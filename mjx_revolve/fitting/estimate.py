@@ -318,9 +318,8 @@ def begin(problem: FitProblem, seed: int) -> FitState:
             starts[:, 5, problem.free_heading] = 2 * np.pi * k / (room + 1)
             points.append(replace(origin, starts=starts))
     else:
-        points += [
-            replace(origin, free=spread * draw.normal(size=len(spread))) for _ in range(room)
-        ]
+        drawn = spread * draw.normal(size=(room, len(spread)))
+        points += [replace(origin, free=free) for free in drawn]
     none = np.zeros(problem.drive.resets.shape)
     costs = recording_costs(problem, points, noise)
     best = origin
@@ -457,9 +456,7 @@ def advance(problem: FitProblem, state: FitState, model: Model) -> tuple[FitStat
     plain = estimate_noise(problem, model.values, numbers_used(problem, system))
     # What errs together counts once: the prior then holds where the model errs, and not the frames.
     inflation = correlation(problem, model.values) if state.inflated else {}
-    noise = {
-        kind: sigma * float(np.sqrt(inflation.get(kind, 1.0))) for kind, sigma in plain.items()
-    }
+    noise = {kind: x * float(np.sqrt(inflation.get(kind, 1.0))) for kind, x in plain.items()}
     system = normal_equations(problem, model, state.point, noise)
     windows, prior = costs_of(problem, state.point, model.values, noise)
     now = float(windows.sum()) + prior

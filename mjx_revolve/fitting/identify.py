@@ -130,9 +130,8 @@ def list_motions(robot: Robot, settings: FitSettings) -> list[PlannedMotion]:
             turn: Sequence[float] = (0, 0, 0)) -> None:  # fmt: skip
         signals = still | {f"command.{n}": TimeSeries(sent, x) for n, x in commands.items()}
         recording = RobotRecording(f"motion {len(found) + 1}", signals)
-        found.append(
-            PlannedMotion(words, recording, np.array(velocity, float), np.array(turn, float))
-        )
+        first = np.array(velocity, float), np.array(turn, float)
+        found.append(PlannedMotion(words, recording, *first))
 
     for axis, way in enumerate(("along x", "along y", "along z")):
         push = np.eye(6)[axis] * length

@@ -31,10 +31,8 @@ class MarkPoints:
         self.robot, table, assembly = robot, robot.fluid, robot.assembly
         last = [int(np.flatnonzero(table.module == mark.module)[-1]) for mark in marks]
         self.body = table.body[last]
-        modules = [robot.morphology.modules[mark.module] for mark in marks]
-        place = [
-            m.position + m.rotation @ mark.place for m, mark in zip(modules, marks, strict=True)
-        ]
+        placed = [(robot.morphology.modules[mark.module], mark.place) for mark in marks]
+        place = [module.position + module.rotation @ at for module, at in placed]
         self.offset = np.array(
             [assembly.rotation[b].T @ (p - assembly.position[b])
              for b, p in zip(self.body, place, strict=True)]

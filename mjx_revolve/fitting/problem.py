@@ -356,8 +356,7 @@ def make_problem(
     local = tuple(f"{n}_{x}" if x else n for n in common for x in RECORDING[n])
     if not parameters:
         raise InputError("--free", "at least one number of the robot", "none")
-    names = [m.name for m in robot.morphology.modules]
-    hinges = [names[k] for k in robot.morphology.hinges]
+    hinges = [robot.morphology.modules[k].name for k in robot.morphology.hinges]
     jets = robot.morphology.thruster_names
     servos_free = any(p.name.startswith("servo") for p in parameters)
     prescribed = _prescribed(recordings, hinges, servos_free)
@@ -413,11 +412,7 @@ def make_problem(
         np.stack([v.hinges_at(v.begin, prescribed, dt)[k] for v in views], -1) for k in range(2)
     )
     drive = Drive(resets, angles, speeds, ctrl, later, begin)
-    channels = [
-        channel
-        for r, view in enumerate(views)
-        for channel in view.channels(r, until[r], servos_free)
-    ]
+    channels = [c for r, v in enumerate(views) for c in v.channels(r, until[r], servos_free)]
     variants = _variants(robot, tuple(own), tuple(h in prescribed for h in hinges))
     return FitProblem(
         robot, tuple(parameters), local, tuple(recordings), settings, begin, end, until, piece,
@@ -466,9 +461,7 @@ def _prescribed(
     if servos_free:
         for r in recordings:
             given = r.signals.keys()
-            lacking = [
-                h for h in hinges if {f"angle.{h}", f"command.{h}"} & given == {f"angle.{h}"}
-            ]
+            lacking = [h for h in hinges if f"angle.{h}" in given and f"command.{h}" not in given]
             if lacking:
                 raise InputError(
                     r.name, "the servos' commands (command.MODULE), as they are free",

@@ -247,9 +247,8 @@ def conclude(
             f"{plan.motions[0].words}: it would leave {after:.2g} of what is not known of "
             f"{problem.parameters[worst].name}, now {now[worst]:.2g}"
         )
-    return Fit(
-        problem, state, found, tuple(values), unknown, local, _predict(problem, state), advice
-    )
+    predictions = _predict(problem, state)
+    return Fit(problem, state, found, tuple(values), unknown, local, predictions, advice)
 
 
 def _predict(problem: FitProblem, state: FitState) -> tuple[Prediction, ...]:

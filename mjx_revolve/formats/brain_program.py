@@ -214,9 +214,8 @@ class Builder:
         sources = tuple(dict.fromkeys(number for number, _ in chosen))
         if len(sources) == 1 and [k for _, k in chosen] == [*range(self.values[sources[0]].size)]:
             return sources[0]
-        starts = dict(
-            zip(sources, np.cumsum([0, *(self.values[n].size for n in sources)]), strict=False)
-        )
+        sizes = [self.values[number].size for number in sources]
+        starts = dict(zip(sources, np.cumsum([0, *sizes]), strict=False))
         where = tuple(int(starts[number]) + k for number, k in chosen)
         known = [self.values[n].data for n in sources]
         data = None

@@ -235,9 +235,7 @@ def _read_urdf(root: Element, path: Path) -> RigidRobot:
     tops = [name for name in links if name not in children]
     if len(tops) != 1:
         raise InputError(f"expected one root link; found {', '.join(tops) or 'none'}")
-    colors = {
-        material.get("name", ""): material.find("color") for material in root.findall("material")
-    }
+    colors = {one.get("name", ""): one.find("color") for one in root.findall("material")}
     place, reached = (np.zeros(3), np.eye(3)), set()
     stack: list[tuple[str, int, Any, str, Any]] = [(tops[0], -1, place, tops[0], None)]
     while stack:

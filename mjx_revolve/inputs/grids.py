@@ -111,9 +111,8 @@ def combine(axes: Sequence[GridAxis], otherwise: str) -> dict[str, tuple[str, ..
         raise InputError("--set", f"at most {_MAX_CASES} combinations", count)
     several = [axis.key for axis in axes if len(axis.texts) > 1]
     leaves = [key.rpartition(".")[2] for key in several]
-    words = [
-        key if leaves.count(leaf) > 1 else leaf for key, leaf in zip(several, leaves, strict=True)
-    ]
+    pairs = zip(several, leaves, strict=True)
+    words = [key if leaves.count(leaf) > 1 else leaf for key, leaf in pairs]
     cases: dict[str, tuple[str, ...]] = {}
     for texts in itertools.product(*(axis.texts for axis in axes)):
         values = {axis.key: text for axis, text in zip(axes, texts, strict=True)}

@@ -131,9 +131,8 @@ def _describe(kind: ModuleType, part: Part) -> str:
         (part.ballast_volume, "ballast or float", np.asarray(part.ballast_position)),
     ):
         if volume:
-            words.append(
-                f"{_amount(1e6 * volume)} cm³ of {what} at ({_numbers(1e3 * center, 4)}) mm"
-            )
+            place = _numbers(1e3 * center, 4)
+            words.append(f"{_amount(1e6 * volume)} cm³ of {what} at ({place}) mm")
     if part.ballast_mass:
         place = _numbers(1e3 * np.asarray(part.ballast_position), 4)
         words.append(f"{_amount(1e3 * part.ballast_mass)} g of ballast at ({place}) mm")

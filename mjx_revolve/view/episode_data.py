@@ -80,9 +80,8 @@ def episode_data(episode: Episode, forces: bool = True) -> Packed:
     moved = float(np.linalg.norm(net)) > 0.05 * length
     fastest = float(np.linalg.norm(current, axis=1).max())
     moving = {"fastest": fastest, "velocity": pack_floats(current)}
-    data = replay_data(
-        [ReplayRobot(episode.title, robot, time, qpos)], low - 0.1 * length, begun=begun
-    )
+    shown = ReplayRobot(episode.title, robot, time, qpos)
+    data = replay_data([shown], low - 0.1 * length, begun=begun)
     data["world"]["surface"] = surface
     return data | pack_poses([time], [qpos], _STEPS) | {
         "many": False,

@@ -60,9 +60,8 @@ def finite_rows(episode: Episode) -> tuple[Episode, float | None]:
 def cut_episode(episode: Episode, seconds: float) -> Episode:
     """An episode's first seconds."""
     time = np.asarray(episode.trajectory.time)
-    return _first_rows(
-        episode, max(1, int(np.searchsorted(time, seconds * (1 + 1e-6), side="right")))
-    )
+    count = int(np.searchsorted(time, seconds * (1 + 1e-6), side="right"))
+    return _first_rows(episode, max(1, count))
 
 
 def _first_rows(episode: Episode, count: int) -> Episode:

@@ -133,9 +133,8 @@ def plan_shots(
     above = bool(np.median(depth) < _AFLOAT * largest)
     margin = _AIR * distance
     # Whether the bed is close below for half of the time.
-    near = (
-        bed is not None and np.median(center[:, 2] - bed(*center[:, :2].T)) < _NEAR_BED * distance
-    )
+    over_bed = np.inf if bed is None else np.median(center[:, 2] - bed(*center[:, :2].T))
+    near = over_bed < _NEAR_BED * distance
     elevation = _HIGH if above or near else _LEVEL
     low: Any = surface + waves + margin if above else -np.inf
     high = np.inf if above else surface - waves - 0.5 * margin

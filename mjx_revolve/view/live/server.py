@@ -114,9 +114,8 @@ class _Handler(BaseHTTPRequestHandler):
         size = int(length) if length.isascii() and length.isdigit() and len(length) < 9 else -1
         if not 0 <= size <= _MAX_CONTENT:
             self.close_connection = True
-            self._refuse(
-                HTTPStatus.BAD_REQUEST, f"expected at most {_MAX_CONTENT} bytes; found others"
-            )
+            why = f"expected at most {_MAX_CONTENT} bytes; found others"
+            self._refuse(HTTPStatus.BAD_REQUEST, why)
             return
         text = self.rfile.read(size)
         origin, kind = self.headers.get("Origin"), self.headers.get_content_type()
@@ -125,9 +124,8 @@ class _Handler(BaseHTTPRequestHandler):
         elif origin is not None and origin not in self.server.origins:
             self._refuse(HTTPStatus.FORBIDDEN, f"Origin: expected our own page; found {origin!r}")
         elif kind != "application/json":  # what another page may post without asking first
-            self._refuse(
-                HTTPStatus.UNSUPPORTED_MEDIA_TYPE, f"expected application/json; found {kind}"
-            )
+            why = f"expected application/json; found {kind}"
+            self._refuse(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, why)
         else:
             self._obey(text)
 

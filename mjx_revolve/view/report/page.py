@@ -175,14 +175,12 @@ def _colony(record: RunRecord, history: ColonyHistory) -> str:
     if not history.spans:
         return ""
     colony = None if record.config is None else record.config.colony
-    room = record.setting("evolution.population_size")
-    figures = plot_history(
-        history, colony, room if isinstance(room, int) else None, record.individual
-    )
+    size = record.setting("evolution.population_size")
+    room = size if isinstance(size, int) else None
+    figures = plot_history(history, colony, room, record.individual)
     # Thousands of lines and dots take less room as points of a picture.
-    sources = {
-        name: data_address(figure_png(figure), "image/png") for name, figure in figures.items()
-    }
+    pictures = {name: figure_png(figure) for name, figure in figures.items()}
+    sources = {name: data_address(png, "image/png") for name, png in pictures.items()}
     command = viewer_command(record, "--colony")
     return sections.colony(tables.colony_table(history), sources, command)
 
