@@ -76,11 +76,8 @@ def main(argv: list[str] | None = None) -> int:
     with opening(*named, trust=arguments.trust):
         catalogue = load_catalogue(arguments.paths, arguments.world)
         room = arguments.robots
-        simulation = LiveSimulation(
-            make_tank(catalogue.mixed, room, spheres=catalogue.spheres),
-            catalogue.world,
-            catalogue.entries,
-        )
+        tank = make_tank(catalogue.mixed, room, spheres=catalogue.spheres)
+        simulation = LiveSimulation(tank, catalogue.world, catalogue.entries)
         try:
             server = LiveServer(simulation, live_page(catalogue, room), arguments.port)
         except OSError as error:

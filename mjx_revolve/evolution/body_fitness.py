@@ -40,6 +40,9 @@ _EXAMPLES = 64
 # Long episodes of each body that are looked at, each with coefficients of its own. A choice.
 _LONG_TRIALS = 8
 
+Genes = Sequence[np.ndarray]
+"""Of several bodies."""
+
 
 @dataclass(frozen=True, eq=False)
 class BodyFitness:
@@ -87,7 +90,7 @@ class BodyFitness:
         return block is not None and self.bodies.learning.blocks_of_body(block) > 0
 
     def step_changes(
-        self, bodies: Sequence[Morphology], genes: Sequence[np.ndarray], key: jax.Array
+        self, bodies: Sequence[Morphology], genes: Genes, key: jax.Array
     ) -> np.ndarray:
         """`[bodies]` shares by which scores of bodies with brains change at half the timestep.
 
@@ -98,11 +101,7 @@ class BodyFitness:
         return np.abs(fine - usual) / np.maximum(np.abs(usual), 1e-9)
 
     def kept_shares(
-        self,
-        bodies: Sequence[Morphology],
-        genes: Sequence[np.ndarray],
-        key: jax.Array,
-        seconds: float,
+        self, bodies: Sequence[Morphology], genes: Genes, key: jax.Array, seconds: float
     ) -> np.ndarray:
         """`[bodies]` shares of scores, as rates, that bodies with brains keep for `seconds` [s].
 
@@ -118,11 +117,7 @@ class BodyFitness:
         return kept / np.maximum(usual, 1e-9)
 
     def _scores_with(
-        self,
-        bodies: Sequence[Morphology],
-        genes: Sequence[np.ndarray],
-        key: jax.Array,
-        **changes: Any,
+        self, bodies: Sequence[Morphology], genes: Genes, key: jax.Array, **changes: Any
     ) -> np.ndarray:
         """`[bodies]` scores of bodies with brains, with other settings; robust only if so given."""
         mixed = make_mixed_fitness(self.config, bodies, **({"task.robust": None} | changes))

@@ -131,12 +131,9 @@ class ColonyEvolution(IndividualEvolution, Evolution[Colony, ColonyInterval, Tan
         self._synchronize(proposal.colony, colony, shift)
         self._held = self.tank.to_arrays()
         living = [rules.measured(member) for member in colony.members.values()]
-        colony = replace(
-            colony,
-            elites=best_individuals([*colony.elites, *colony.died, *living]),
-            tank=self._held,
-            events=(*colony.events, *deaths, *matings, *births),
-        )
+        elites = best_individuals([*colony.elites, *colony.died, *living])
+        events = (*colony.events, *deaths, *matings, *births)
+        colony = replace(colony, elites=elites, tank=self._held, events=events)
         scores = np.array([individual.score for individual in living])
         champion = colony.elites[0].score if colony.elites else float("nan")
         return Generation(

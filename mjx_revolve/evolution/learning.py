@@ -18,7 +18,7 @@ import numpy as np
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.episodes.bodies_config import LearningConfig
 from mjx_revolve.evolution.blocks import Scored, join, take
-from mjx_revolve.evolution.body_fitness import BodyFitness
+from mjx_revolve.evolution.body_fitness import BodyFitness, Genes
 from mjx_revolve.evolution.brains import GeneLayout
 from mjx_revolve.evolution.executor import Executor
 from mjx_revolve.evolution.individuals import Individual
@@ -201,10 +201,7 @@ def learnt_genes(fitness: BodyFitness, individual: Individual) -> np.ndarray:
 
 
 def score_brains(
-    executor: Executor,
-    individuals: Sequence[Individual],
-    genes: Sequence[np.ndarray],
-    key: jax.Array,
+    executor: Executor, individuals: Sequence[Individual], genes: Genes, key: jax.Array
 ) -> list[Scored]:
     """Scores several brains of each of several bodies.
 

@@ -200,11 +200,8 @@ class FitProblem:
     def origin(self) -> Point:
         """The priors' medians."""
         windows, _, count = self.roots.shape
-        return Point(
-            np.zeros(len(self.parameters)),
-            np.zeros((count, len(self.local))),
-            np.zeros((windows, START, count)),
-        )
+        shapes = (len(self.parameters),), (count, len(self.local)), (windows, START, count)
+        return Point(*map(np.zeros, shapes))
 
     @property
     def local_spread(self) -> np.ndarray:

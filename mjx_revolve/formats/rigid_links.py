@@ -26,6 +26,7 @@ from mjx_revolve.inputs.files import read_file
 from mjx_revolve.numerics.spatial import quat_to_matrix
 
 Place = tuple[np.ndarray, np.ndarray]  # position [3] [m] and rotation [3, 3]
+Color = tuple[float, ...]
 _Hinge = tuple[np.ndarray, np.ndarray, dict[str, Any]]  # axis, anchor [m] and limits
 
 
@@ -47,7 +48,7 @@ class Shape:
     rotation: np.ndarray
     volume: float
     center: np.ndarray
-    rgb: tuple[float, ...] | None = None
+    rgb: Color | None = None
 
 
 @dataclass
@@ -163,11 +164,7 @@ def closed_volume(triangles: np.ndarray) -> tuple[float, np.ndarray] | None:
 
 
 def _mesh(
-    triangles: np.ndarray,
-    place: Place,
-    rgb: tuple[float, ...] | None,
-    name: str,
-    missing: list[str],
+    triangles: np.ndarray, place: Place, rgb: Color | None, name: str, missing: list[str]
 ) -> Shape:
     """The shape of a mesh, with triangles in the mesh's own frame."""
     position, rotation = place
@@ -328,7 +325,7 @@ def _shape(
     yield _box(kind.tag, size, place, rgb)
 
 
-def _box(kind: str, size: np.ndarray, place: Place, rgb: tuple[float, ...] | None) -> Shape:
+def _box(kind: str, size: np.ndarray, place: Place, rgb: Color | None) -> Shape:
     edges, volume = box_around(kind, size)
     return Shape(edges, place[0], place[1], volume, place[0], rgb)
 

@@ -226,12 +226,8 @@ class _Messages:
         linear = velocity[:3] @ quat_to_matrix(quat)
         pose = ros.Pose(ros.Point(*position.tolist()), self.quaternion(quat))
         twist = ros.Twist(ros.Vector3(*linear.tolist()), ros.Vector3(*velocity[3:].tolist()))
-        return ros.Odometry(
-            self.header(time, ODOM),
-            BASE,
-            ros.PoseWithCovariance(pose, none),
-            ros.TwistWithCovariance(twist, none),
-        )
+        both = ros.PoseWithCovariance(pose, none), ros.TwistWithCovariance(twist, none)
+        return ros.Odometry(self.header(time, ODOM), BASE, *both)
 
     def commands(self, names: list[str], values: np.ndarray) -> Any:
         """Commands of the thrusters; the layout's label names them."""

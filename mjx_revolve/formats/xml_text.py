@@ -75,8 +75,5 @@ def to_list(lines: Iterable[tuple[object, str]]) -> str:
     Args:
         lines: whether each applies, and its text.
     """
-    return "\n".join(
-        textwrap.fill(line, 98, initial_indent="  - ", subsequent_indent="    ")
-        for holds, line in lines
-        if holds
-    )
+    wrapper = textwrap.TextWrapper(98, initial_indent="  - ", subsequent_indent="    ")
+    return "\n".join(wrapper.fill(line) for holds, line in lines if holds)

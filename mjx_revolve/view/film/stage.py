@@ -153,14 +153,8 @@ def _add_bed(
     points = rings.reshape(-1, 3)
     # Whole tiles less: near 0 single precision has more digits.
     texels = (points[:, :2] - _TILE * np.floor(origin[:2] / _TILE)) / _TILE
-    _add_mesh(
-        spec,
-        "sand",
-        points - origin,
-        faces,
-        usertexcoord=texels.ravel(),
-        userfacetexcoord=faces.ravel(),
-    )
+    lies = {"usertexcoord": texels.ravel(), "userfacetexcoord": faces.ravel()}
+    _add_mesh(spec, "sand", points - origin, faces, **lies)
     kind = mujoco.mjtGeom.mjGEOM_MESH
     spec.worldbody.add_geom(name="sand", type=kind, meshname="sand", material="sand", group=MODULES)
 
