@@ -12,14 +12,7 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from mjx_revolve.inputs.commands import (
-    Parser,
-    program,
-    read_path,
-    read_world,
-    run_command,
-    whole,
-)
+from mjx_revolve.inputs.commands import Parser, program, read_path, read_world, run_command, whole
 from mjx_revolve.inputs.errors import plain
 from mjx_revolve.inputs.trust import add_trust_argument, opening
 from mjx_revolve.numerics.runtime import prepare_process
@@ -48,10 +41,7 @@ def main(argv: list[str] | None = None) -> int:
         prog=program("live"),
         description="Run a world in real time and show it in a browser: drop robots, change the "
         "current, watch. Only this machine can open the page.",
-        examples=(
-            "live runs/mine",
-            "live spider gecko --world lake --robots 4",
-        ),
+        examples=("live runs/mine", "live spider gecko --world lake --robots 4"),
     )
     add = parser.add_argument
     add("paths", nargs="*", type=read_path, metavar="RUN|CONFIG|MORPHOLOGY",

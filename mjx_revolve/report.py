@@ -24,10 +24,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog=program("report"),
         description="Writes a page about runs: one HTML file that needs nothing else.",
-        examples=(
-            "report runs/mine",
-            "report runs/a runs/b --out both.html",
-        ),
+        examples=("report runs/mine", "report runs/a runs/b --out both.html"),
     )
     add = parser.add_argument
     add("runs", nargs="+", type=read_path, metavar="RUN",

@@ -21,12 +21,7 @@ from mjx_revolve.engine.plant import plant_of
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.bodies_config import BodiesConfig
 from mjx_revolve.episodes.config import Config
-from mjx_revolve.episodes.fitness import (
-    Fitness,
-    MixedFitness,
-    fit_body,
-    make_mixed_fitness,
-)
+from mjx_revolve.episodes.fitness import Fitness, MixedFitness, fit_body, make_mixed_fitness
 from mjx_revolve.episodes.measure_table import MEASURES
 from mjx_revolve.episodes.named_files import read_modules, read_world
 from mjx_revolve.evolution.blocks import block_size

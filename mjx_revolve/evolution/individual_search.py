@@ -10,14 +10,7 @@ import jax
 import numpy as np
 
 from mjx_revolve.episodes.config import Config
-from mjx_revolve.episodes.passport import (
-    KEPT,
-    LONG,
-    STEP,
-    Passport,
-    joint_checks,
-    make_passport,
-)
+from mjx_revolve.episodes.passport import KEPT, LONG, STEP, Passport, joint_checks, make_passport
 from mjx_revolve.episodes.scoring import replay_key
 from mjx_revolve.evolution.blocks import Scored, join
 from mjx_revolve.evolution.body_fitness import BodyFitness

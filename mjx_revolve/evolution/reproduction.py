@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-import numpy as np
+from numpy.random import Generator
 
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.evolution.body_fitness import BodyFitness
@@ -12,11 +12,7 @@ from mjx_revolve.evolution.individuals import Individual
 
 
 def make_founders(
-    fitness: BodyFitness,
-    rngs: Sequence[np.random.Generator],
-    number: int,
-    generation: int,
-    sow: bool,
+    fitness: BodyFitness, rngs: Sequence[Generator], number: int, generation: int, sow: bool
 ) -> Iterator[Individual]:
     """Individuals without parents: the configured seeds, mutants of them, then random ones.
 
@@ -40,7 +36,7 @@ def make_founders(
 
 def make_founder(
     fitness: BodyFitness,
-    rng: np.random.Generator,
+    rng: Generator,
     number: int,
     generation: int,
     seed: Morphology | None = None,
@@ -71,7 +67,7 @@ def make_founder(
 
 def make_child(
     fitness: BodyFitness,
-    rng: np.random.Generator,
+    rng: Generator,
     number: int,
     generation: int,
     first: Individual,
@@ -111,7 +107,7 @@ def make_child(
 
 def _grow(
     fitness: BodyFitness,
-    rng: np.random.Generator,
+    rng: Generator,
     number: int,
     parents: Sequence[Individual],
     generation: int,

@@ -142,11 +142,7 @@ class RunFolder(RunReader):
     # --- checkpoints ---
 
     def save_checkpoint(
-        self,
-        generation: int,
-        arrays: Mapping[str, np.ndarray],
-        meta: Mapping[str, object],
-        keep: int,
+        self, generation: int, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], keep: int
     ) -> Path:
         """Saves any arrays but object arrays, and values for JSON; the newest `keep` stay."""
         logs = self._positions()

@@ -301,10 +301,7 @@ def run_plans(
     began, ran, code = time.perf_counter(), 0, 0
     left = sum(step != "finished" for step in steps.values())
     width = len(str(len(steps)))
-    with (
-        Interrupts() as interrupts,
-        contextlib.closing(SharedExecutor(make_executor)) as executors,
-    ):
+    with Interrupts() as interrupts, contextlib.closing(SharedExecutor(make_executor)) as executors:
         interrupts.finish_first("stopping after the generation under way")
         for k, (plan, step) in enumerate(steps.items()):
             if interrupts.signal:

@@ -38,12 +38,7 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 from pydantic_core import ArgsKwargs
 
 from mjx_revolve.inputs.errors import ConstraintError, show
-from mjx_revolve.inputs.validation_messages import (
-    fields_of,
-    find_problems,
-    join,
-    refuse,
-)
+from mjx_revolve.inputs.validation_messages import fields_of, find_problems, join, refuse
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., object])

@@ -12,13 +12,7 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.champion import Episode
 from mjx_revolve.view.forces import module_forces, sum_modules
 from mjx_revolve.view.motion import smooth_path, speed_over, stroke_period
-from mjx_revolve.view.page_data import (
-    Packed,
-    pack_floats,
-    pack_poses,
-    pack_quantized,
-    replay_data,
-)
+from mjx_revolve.view.page_data import Packed, pack_floats, pack_poses, pack_quantized, replay_data
 from mjx_revolve.view.palette import FORCES
 from mjx_revolve.view.poses import finite_rows, pose_robot
 from mjx_revolve.view.recording import ReplayRobot

@@ -17,23 +17,12 @@ from mjx_revolve.inputs.files import short_path, write_atomic
 from mjx_revolve.inputs.grids import read_axes
 from mjx_revolve.view.body_pictures import plot_bodies
 from mjx_revolve.view.convergence import COLONY_LABEL, plot_cases
-from mjx_revolve.view.outcomes import (
-    Outcome,
-    by_case,
-    find_outcomes,
-    write_csv,
-)
+from mjx_revolve.view.outcomes import Outcome, by_case, find_outcomes, write_csv
 from mjx_revolve.view.plots import label_of, letter, with_unit
 from mjx_revolve.view.report.groups import setting_words
 from mjx_revolve.view.report.page import default_page, make_page, sections, svg_source
 from mjx_revolve.view.report.tables import format_number
-from mjx_revolve.view.statistics import (
-    ALPHA,
-    compare,
-    difference,
-    interval,
-    smallest_p,
-)
+from mjx_revolve.view.statistics import ALPHA, compare, difference, interval, smallest_p
 
 TABLE = "sweep.csv"
 # Pairs of more cases than this are not tested: Holm's correction would leave nothing (a choice).
