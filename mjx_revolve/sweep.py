@@ -107,13 +107,8 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
           f"{short_path(folder)}", flush=True)  # fmt: skip
     again = f"{program_again('sweep')} {shlex.join(argv)}"
     workers, cluster = arguments.workers, arguments.cluster
-    code = run_plans(
-        steps,
-        lambda config: make_executor(config, workers, make_fitness, cluster),
-        save_pictures,
-        again,
-        arguments.trust,
-    )
+    make = lambda config: make_executor(config, workers, make_fitness, cluster)  # noqa: E731
+    code = run_plans(steps, make, save_pictures, again, arguments.trust)
     if code not in (0, 2):  # runs that failed by themselves leave the others to report on
         return code
     print("writing the report", flush=True)

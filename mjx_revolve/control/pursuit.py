@@ -55,10 +55,8 @@ def step_pursuer(pursuer: Pursuer, limits: PursuitLimits, robot: Vec, dt: float)
     ahead, wanted = pursuer.heading, vsub(robot, pursuer.position)
     away = safe_norm(wanted)
     # Where the two coincide, the heading stays.
-    wanted = tuple(
-        jnp.where(away > 0, w / jnp.maximum(away, 1e-12), a)
-        for w, a in zip(wanted, ahead, strict=True)
-    )
+    pairs = zip(wanted, ahead, strict=True)
+    wanted = tuple(jnp.where(away > 0, w / jnp.maximum(away, 1e-12), a) for w, a in pairs)
     along = dot(ahead, wanted)
     aside = vsub(wanted, vscale(along, ahead))
     # To the left where the robot is straight behind; x axis of the world if it heads up or down.

@@ -179,10 +179,8 @@ def evaluate_again(
         if np.isnan(scores[0]):
             continue
         count = one.evaluations + 1
-        mean = {
-            name: _add_to_mean(x, float(measures[name][0]), count)
-            for name, x in one.measures.items()
-        }
+        old = one.measures.items()
+        mean = {name: _add_to_mean(x, float(measures[name][0]), count) for name, x in old}
         blew_up = np.isneginf(scores[0])
         score = np.nan if blew_up else _add_to_mean(one.score, float(scores[0]), count)
         means[one.number] = replace(one, score=score, measures=mean, evaluations=count)

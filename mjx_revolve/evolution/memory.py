@@ -76,10 +76,8 @@ def free_memory(root: Path = Path("/")) -> int | None:
                 found.append(1024 * int(line.split()[1]))
     with contextlib.suppress(OSError, ValueError):  # no container, or one without a limit ("max")
         group = root / "sys/fs/cgroup"
-        limit, used = (
-            int((group / name).read_text(encoding="ascii"))
-            for name in ("memory.max", "memory.current")
-        )
+        files = group / "memory.max", group / "memory.current"
+        limit, used = (int(file.read_text(encoding="ascii")) for file in files)
         cache = 0  # of files, which the kernel gives back
         with contextlib.suppress(OSError, ValueError):
             for line in (group / "memory.stat").read_text(encoding="ascii").splitlines():

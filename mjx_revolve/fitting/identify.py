@@ -113,10 +113,8 @@ def list_motions(robot: Robot, settings: FitSettings) -> list[PlannedMotion]:
         settings: their length and the frames' rate.
     """
     length = float(body_geometry(robot).length)
-    time, sent = (
-        np.arange(0.0, settings.duration + 1e-9, 1 / rate)
-        for rate in (settings.rate, max(settings.rate, _SENT))
-    )
+    rates = settings.rate, max(settings.rate, _SENT)
+    time, sent = (np.arange(0.0, settings.duration + 1e-9, 1 / rate) for rate in rates)
     modules = robot.morphology.modules
     hinges = [modules[k].name for k in robot.morphology.hinges]
     parts = [modules[k].kind.parts[i].thruster for k, i in robot.morphology.thrusters]

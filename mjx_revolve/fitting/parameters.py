@@ -214,10 +214,8 @@ def _plain_value(
 
         def scaled(value: float) -> dict[str, Any]:
             thrust = "thrust" if field.startswith("gain") else ""
-            return {
-                m: {"thruster": {field: value * getattr(jet, field) / own(m, thrust)}}
-                for m, jet in jets.items()
-            }
+            found = {m: value * getattr(j, field) / own(m, thrust) for m, j in jets.items()}
+            return {m: {"thruster": {field: x}} for m, x in found.items()}
 
         return Parameter(text, "", 1.0, math.log(_THRUSTER[field]), True, scaled)
     if head not in ("ballast", "ballast_position"):

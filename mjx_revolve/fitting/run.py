@@ -341,15 +341,10 @@ def _unpack(path: Path) -> tuple[RobotRecording, ...]:
             about = parse_yaml(data["about"].tobytes(), path)
             found = []
             for r, one in enumerate(about):
-                signals = {
-                    key.partition("/")[2]: TimeSeries(*data[key])
-                    for key in data.files
-                    if key.startswith(f"{r}/")
-                }
-                marks = {
-                    name: MarkedPoint(int(k), (x, y, z))
-                    for name, (k, x, y, z) in one["marks"].items()
-                }
+                own = [key for key in data.files if key.startswith(f"{r}/")]
+                signals = {key.partition("/")[2]: TimeSeries(*data[key]) for key in own}
+                placed = one["marks"].items()
+                marks = {name: MarkedPoint(int(k), (x, y, z)) for name, (k, x, y, z) in placed}
                 found.append(RobotRecording(one["name"], signals, marks, tuple(one["notes"])))
     except InputError:
         raise

@@ -141,9 +141,8 @@ def _messages(
     joints = [link.joint for link in links if link.joint is not None]
     names, none = [joint.name for joint in joints], np.zeros(0)
     rows, stamps = pick_rows(robot, trajectory)
-    qpos, qvel, ctrl = (
-        np.asarray(x, np.float64)[rows] for x in (trajectory.qpos, trajectory.qvel, trajectory.ctrl)
-    )
+    whole = trajectory.qpos, trajectory.qvel, trajectory.ctrl
+    qpos, qvel, ctrl = (np.asarray(x, np.float64)[rows] for x in whole)
     # The encoder requires contiguous rows.
     angles = np.ascontiguousarray(qpos[:, [joint.qpos for joint in joints]])
     speeds = np.ascontiguousarray(qvel[:, [joint.qvel for joint in joints]])

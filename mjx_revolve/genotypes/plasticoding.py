@@ -299,11 +299,8 @@ class _Turtle:
         if self.side is None:
             return
         slot = self._slot(self.side)
-        free = [
-            number
-            for number in self.growth.modules[self._here].kind.slots
-            if self.growth.child(self._here, number) is None
-        ]
+        slots = self.growth.modules[self._here].kind.slots
+        free = [number for number in slots if self.growth.child(self._here, number) is None]
         if slot not in free:
             if not free or any(number in _SIDES.values() for number in free):
                 return

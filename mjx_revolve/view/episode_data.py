@@ -132,11 +132,8 @@ def _arrows(episode: Episode, every: int, water: Water) -> Packed:
 
 def _no_arrows(why: str | None = None) -> Packed:
     """Every kind of force without arrows, and why there are none; None: there is no force."""
-    none = pack_quantized(np.zeros(0))
-    return {
-        name: {"color": color, "scale": 0.0, "force": none, "why": why}
-        for name, color in FORCES.items()
-    }
+    none = {"scale": 0.0, "force": pack_quantized(np.zeros(0)), "why": why}
+    return {name: {"color": color, **none} for name, color in FORCES.items()}
 
 
 def _first(value: ArrayLike) -> float:

@@ -71,13 +71,8 @@ def make_page(episode: Episode, forces: bool = True) -> str:
     """The replay of an episode as the text of an HTML file; see `write_viewer`."""
     from mjx_revolve.view.episode_data import episode_data
 
-    return fill_page(
-        "replay",
-        maker="viewer",
-        title=episode.title,
-        subtitle=_episode_subtitle(episode),
-        data=episode_data(episode, forces),
-    )
+    subtitle, data = _episode_subtitle(episode), episode_data(episode, forces)
+    return fill_page("replay", maker="viewer", title=episode.title, subtitle=subtitle, data=data)
 
 
 def write_colony_page(
