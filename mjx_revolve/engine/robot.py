@@ -21,7 +21,7 @@ from mjx_revolve.engine.edited_model import check_edit, edited_assembly
 from mjx_revolve.engine.fluid_table import FluidTable
 from mjx_revolve.engine.mujoco_model import compile_model
 from mjx_revolve.engine.step_constants import inertia_boxes
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, note
 from mjx_revolve.inputs.packages import check_package
 from mjx_revolve.water.drag import drags_whole_bodies, find_drag_law
 from mjx_revolve.water.world import World
@@ -257,7 +257,20 @@ def build_robot(morphology: Morphology, world: World) -> Robot:
     kinds = {id(module.kind): module.kind for module in morphology.modules}
     if not all(map(_is_sound, kinds.values())):
         _ = robot.mj_model  # raises where MuJoCo refuses it
+    _note_soft_bed(morphology, world)
     return robot
+
+
+def _note_soft_bed(morphology: Morphology, world: World) -> None:
+    """A remark where a robot on four corners sinks into the bed by a tenth of its largest box."""
+    bed, weight = world.bed, world.gravity * (morphology.mass - world.density * morphology.volume)
+    height = max(min(part.boxes[0].size) for m in morphology.modules for part in m.kind.parts)
+    if bed is not None and bed.contact == "penalty" and weight / 4 > 0.1 * height * bed.stiffness:
+        note(
+            f"{morphology.name}: {weight:.3g} N in water sink {weight / 4 / bed.stiffness:.2g} m "
+            f"into a bed of {bed.stiffness:g} N/m at each of four corners: set bed.stiffness to "
+            f"{weight / (0.04 * height):.1g} N/m or more"
+        )
 
 
 # Least mass [kg] and inertia [kg·m²] of a moving body for MuJoCo (mjMINVAL).

@@ -34,7 +34,8 @@ class Bed:
         height: height of the plane, or of the lake's deepest place, world frame [m].
         highest: height of the lake's shore [m]; unused by "flat".
         extent: side of the square that is drawn and that "lake" is shaped in [m].
-        stiffness: of one contact point, for bodies of any mass: the spring is implicit; ten times
+        stiffness: of one contact point. The spring is implicit, so that no mass needs a shorter
+            step, but a robot of a weight w in water sinks in by some w / (4 stiffness); ten times
             the default throws thin plates in air [N/m].
         friction: Coulomb coefficient [-].
         contact: what keeps robots out of it: "penalty" (see `contact.bed_contact`), or "mjx", the

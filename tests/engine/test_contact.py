@@ -93,6 +93,12 @@ def test_gradient_is_finite_at_rest_and_at_touch_down():
             assert np.all(np.isfinite(jax.grad(pull, (0, 1))(depth, speed)))
 
 
+def test_a_bed_too_soft_for_a_robot_is_noted(caplog):
+    for gravity, notes in ((G, 0), (1e3 * G, 1)):
+        build_robot(body("spider"), world(gravity=gravity, bed=FLAT))
+        assert caplog.text.count("N in water sink") == notes
+
+
 def test_plane_below_a_body():
     """Its height, and a unit normal across both slopes; flat beds have (0, 0, 1)."""
     x, y = np.random.default_rng(1).uniform(-450, 450, (2, 200)).astype(np.float32)

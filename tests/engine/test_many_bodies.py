@@ -385,10 +385,7 @@ def test_types_that_no_example_has_score_as_alone(stranger):
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("hinge", [False, True])
 def test_bodies_of_one_module_score_in_a_batch_and_with_populations_of_their_own(config, hinge):
-    """Two cores, or with a hinge each; three individuals of each, who are told apart if they can.
-
-    XLA:CPU aborts the process over loops of no row and of one.
-    """
+    """Two cores, or with a hinge each: XLA:CPU aborts over loops of no row and of one."""
     cores = [body("core"), read("body: {type: Core}")]
     if hinge:
         cores = [add_module(core, 0, 1, "ActiveHinge", name="tail") for core in cores]

@@ -179,10 +179,7 @@ def test_nothing_falls_through(wet):
 
 @pytest.mark.long
 def test_jointed_without_water_it_is_mujocos_step():
-    """An elbow tips onto its corners; its hinges are soft springs, without what is ours alone.
-
-    Until MJX leaves a corner out: of a box, it takes those within 1 mm of the deepest.
-    """
+    """An elbow tips onto its corners, until MJX leaves one out: it takes those within 1 mm."""
     robot = elbow_robot(world(gravity=G, bed=FLAT))
     model = copy.copy(robot.mj_model)
     # MuJoCo knows no top speed, and its solver does not see the hinges' friction, as ours does.
