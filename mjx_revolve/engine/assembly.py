@@ -66,6 +66,8 @@ class Assembly:
             limb or the robot [N·m/rad].
         fluid: tables of the parts.
         thruster_row: `[nthruster]` their parts.
+        inertia_axes: `[nbody, 3, 3]` principal axes, body frame, as an edited model gives them;
+            None as built.
     """
 
     __repr__ = short_repr
@@ -92,6 +94,7 @@ class Assembly:
     implicit_stiffness: np.ndarray
     fluid: FluidTable
     thruster_row: np.ndarray
+    inertia_axes: np.ndarray | None = None
 
     @cached_property
     def stops(self) -> np.ndarray:

@@ -101,6 +101,7 @@ def edited_assembly(assembly: Assembly, model: mujoco.MjModel, servos: Sequence[
         mass=model.body_mass.copy(),
         center=model.body_ipos.copy(),
         inertia=np.einsum("bij,bj,bkj->bik", axes, model.body_inertia, axes),
+        inertia_axes=axes,
         range=reach,
         damping=filled(assembly.damping, model.dof_damping[dof]),
         stiffness=filled(assembly.stiffness, -model.actuator_biasprm[act, 1]),

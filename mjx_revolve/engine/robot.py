@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import io
+import math
 import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -266,10 +267,11 @@ def _note_soft_bed(morphology: Morphology, world: World) -> None:
     bed, weight = world.bed, world.gravity * (morphology.mass - world.density * morphology.volume)
     height = max(min(part.boxes[0].size) for m in morphology.modules for part in m.kind.parts)
     if bed is not None and bed.contact == "penalty" and weight / 4 > 0.1 * height * bed.stiffness:
+        # A power of ten: bodies of one evolution, each of another weight, are noted once.
+        enough = 10.0 ** math.ceil(math.log10(weight / (0.04 * height)))
         note(
-            f"{morphology.name}: {weight:.3g} N in water sink {weight / 4 / bed.stiffness:.2g} m "
-            f"into a bed of {bed.stiffness:g} N/m at each of four corners: set bed.stiffness to "
-            f"{weight / (0.04 * height):.1g} N/m or more"
+            f"{morphology.name}: sinks by more than a tenth of its largest box into a bed of "
+            f"{bed.stiffness:g} N/m, on four corners: set bed.stiffness to {enough:g} N/m or more"
         )
 
 

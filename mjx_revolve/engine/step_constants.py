@@ -334,8 +334,11 @@ def _principal(assembly: Assembly) -> tuple[np.ndarray, np.ndarray]:
     """`[nbody, 3]` principal inertias and `[nbody, 3, 3]` axes, body frame, as MuJoCo has them.
 
     A body of equal inertias has no axes of its own; then its box is a matter of MuJoCo's method,
-    and of a body that is one box, that box's axes count.
+    and of a body that is one box, that box's axes count; of an edited model, its own.
     """
+    if assembly.inertia_axes is not None:
+        own = assembly.inertia_axes
+        return np.einsum("bji,bjk,bki->bi", own, assembly.inertia, own), own
     table, parts = assembly.fluid, assembly.layout.parts
     pieces = np.array([(p.mass > 0) + (p.ballast_mass > 0) for p in parts])[assembly.layout.kind]
     single = np.bincount(table.body, pieces, len(assembly.parent)) == 1

@@ -141,8 +141,10 @@ def check_size(data: object) -> None:
             raise _too_deep()
         if count > _MAX_NODES:
             raise InputError(f"expected at most {_MAX_NODES} values; found more (aliases?)")
-        inner = item.values() if isinstance(item, dict) else item if isinstance(item, list) else ()
-        stack.extend((value, depth + 1) for value in inner)
+        if isinstance(item, dict):
+            item = list(item.values())
+        if isinstance(item, list):
+            stack.extend((value, depth + 1) for value in item)
 
 
 def load_yaml(path: str | Path) -> Any:

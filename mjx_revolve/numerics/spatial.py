@@ -46,7 +46,7 @@ def fold(a: np.ndarray) -> float | np.ndarray:
 
 
 def _as(a: Scalar, like: jax.Array) -> Scalar:
-    """A number; a constant in the other's dtype: NumPy's float64 must not widen float32."""
+    """A number, NumPy's in the other's dtype: its float64 must not widen float32."""
     return np.asarray(a, like.dtype) if isinstance(a, np.ndarray | np.generic) else a
 
 

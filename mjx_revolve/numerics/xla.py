@@ -293,10 +293,13 @@ class Graph:
 
                 given = [x for x, u in zip(leaves, used, strict=True) if u]
                 found = fuse_call(compute)(given, *(values[v] for v in inputs))
-                values.update(() if last else zip(outputs, found, strict=True))
+                if not last:
+                    values.update(zip(outputs, found, strict=True))
                 return found
 
-            return [run_piece(number) for number in range(count)][-1]
+            for number in range(count - 1):
+                run_piece(number)
+            return run_piece(count - 1)
 
         return run
 

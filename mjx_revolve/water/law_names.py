@@ -75,7 +75,8 @@ def _read_mapping(value: Any, what: str) -> dict[Any, Any]:
 @also({"type": "object", "additionalProperties": {"type": "number"}}, {"type": "null"})
 def _read_coefficients(value: Any) -> Any:
     """A mapping from names to numbers as sorted pairs, each within its coefficient's bounds."""
-    given = _read_mapping(value, "numbers")  # without any, no law is imported
+    given = _read_mapping(value, "numbers")
+    # Without any, no law is imported.
     known = {c.name: c for _, c in list_coefficients() if not c.own_field} if given else {}
     for name, number in given.items():
         if name not in known:

@@ -90,10 +90,10 @@ def _read_matrix(value: Any) -> Any:
     rows = tuple(map(as_tuple, rows)) if isinstance(rows, tuple) else ()
     if len(rows) == 6 and not any(isinstance(row, tuple) for row in rows):
         rows = tuple((0,) * i + (x,) + (0,) * (5 - i) for i, x in enumerate(rows))
-    square = [isinstance(row, tuple) and len(row) == 6 for row in rows] == [True] * 6
-    numbers = [x for row in rows for x in row] if square else [math.nan]
+    square = len(rows) == 6 and all(isinstance(row, tuple) and len(row) == 6 for row in rows)
+    numbers = [x for row in rows for x in row] if square else []
     plain = all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers)
-    if not plain or not all(abs(x) <= LARGEST for x in numbers):
+    if not square or not plain or not all(abs(x) <= LARGEST for x in numbers):
         raise ConstraintError("", _SIX, show(value))
     matrix = np.array(rows, float)
     size = np.abs(matrix).max()

@@ -179,7 +179,7 @@ def test_nothing_falls_through(wet):
 
 @pytest.mark.long
 def test_jointed_without_water_it_is_mujocos_step():
-    """An elbow tips onto its corners, until MJX leaves one out: it takes those within 1 mm."""
+    """An elbow tips, until MJX leaves a corner out: it has those within 1 mm of the deepest."""
     robot = elbow_robot(world(gravity=G, bed=FLAT))
     model = copy.copy(robot.mj_model)
     # MuJoCo knows no top speed, and its solver does not see the hinges' friction, as ours does.

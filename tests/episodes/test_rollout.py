@@ -32,7 +32,7 @@ def still(elbow):
 
 @pytest.mark.long
 def test_depths_are_below_the_surface_of_the_water_that_is_given():
-    """What is sensed, floats and reads depth moves with the surface, all of it alike."""
+    """An AUV holds 2 m by feedback, from 1 m, in water whose surface stands at 0 and at 5 m."""
     tank = world(**WATER)
     robot = build_robot(trim_neutral(body("auv"), tank.density), tank)
     holds = make_feedback(robot, depth=2.0)

@@ -1,4 +1,4 @@
-"""A Dask cluster: real scheduler and workers on the loopback, which come, go, die and hang."""
+"""A Dask cluster on the loopback, which the tests share, in the order in which they stand here."""
 
 import os
 import shutil

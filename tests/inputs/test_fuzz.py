@@ -1,4 +1,4 @@
-"""Malformed files: each is read as something valid, or refused in one line, and no more."""
+"""Malformed files (`malformed.py`, `make fuzz`): read as something valid, or refused in a line."""
 
 import dataclasses
 import json

@@ -261,7 +261,7 @@ def _champion(record: RunRecord, replay: ChampionReplay | None) -> str:
 
 def _strip_words(motion: Motion) -> str:
     """What the strip below the picture of the way shows; nothing where there is none."""
-    if motion.robot.num_hinges == 0:
+    if motion.robot.num_hinges == 0 or len(motion.time) == 1:
         return ""
     return "; below, the last second" if motion.period is None else "; below, one stroke"
 
