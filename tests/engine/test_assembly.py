@@ -107,7 +107,12 @@ def _descends(m, body, above):
 
 @pytest.mark.long
 def test_the_inertia_box_is_that_of_mujocos_principal_axes():
-    for robot in robots("inertia_box"):
+    plain = build_robot(read("body: {type: Core}"), load_world("lake", drag="inertia_box"))
+    turned = plain.mj_spec
+    root = turned.bodies[1]
+    root.explicitinertial, root.mass, root.inertia = True, 0.1, (1e-4, 2e-4, 2.5e-4)
+    root.ipos, root.iquat = (0.0, 0.0, 0.0), (0.98, 0.0, 0.199, 0.0)
+    for robot in (*robots("inertia_box"), plain.with_model(turned)):
         m, columns = robot.mj_model, read_constants(robot.assembly)
         box = columns.bodies[3]
         i = m.body_inertia[1:]

@@ -282,10 +282,7 @@ def test_ballast_in_the_keel_rights_a_body():
 
 
 def check_slope(robot, *cases, kinks=(), compiled=QUICK):
-    """In float64, the gradient through a rollout against central differences over 2 µ.
-
-    At `kinks` the slopes are one-sided, but numbers.
-    """
+    """In float64, a rollout's gradient against differences over 2 µ, one-sided at `kinks`."""
     steps = 20
 
     def end(inputs):
@@ -343,10 +340,7 @@ def test_gradient_at_rest_and_at_the_waterline():
 
 @pytest.mark.long
 def test_gradient_in_waves_and_in_contact():
-    """In the moment at which the sea is met, too; and sliding over the bed with all corners in it.
-
-    The bed lies so deep that the sea is not felt there.
-    """
+    """In the moment at which the sea is met, too; and sliding over a deep bed, corners in it."""
     tank = world(
         **WATER,
         waves=[{"amplitude": 0.05, "wavelength": 2.0, "direction": 0.5}],
