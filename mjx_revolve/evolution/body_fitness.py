@@ -107,6 +107,8 @@ class BodyFitness:
         swum: dict[str, Any] = {
             "task.duration": seconds, "task.horizon": None, "task.trials": _LONG_TRIALS,
             "task.robust": task.robust and task.robust.model_dump(),
+            # Work grows with time, a rate does not.
+            "task.energy_weight": task.energy_weight * task.duration / seconds,
         }  # fmt: skip
         usual, kept = (self._scores_with(bodies, genes, key, **x) for x in ({}, swum))
         return kept / np.maximum(usual, 1e-9)

@@ -53,6 +53,8 @@ _RECORD = 0.01
 # known of them, and near it by what they are uncertain by, as over more than that the motion of a
 # robot that tumbles is not linear, and its mean gradient is another one. Choices.
 _STEP, _FREE_STEP, _FREE_SHARE, _FINEST = 1e-3, 0.02, 0.2, 1e-4
+# Of a clock, two of the usual steps: over less, jumps of held commands are its slope [s].
+_CLOCK_STEP = 0.01
 # The search begins with windows that are so many times shorter: a robot that tumbles for seconds
 # leads a search that begins far from its numbers astray. A choice.
 _PARTS = 4
@@ -222,7 +224,7 @@ class FitProblem:
             k = self.local.index("clock")
             base = shifts[0].local[:, k]
             pair = [[f(t + s) for f, t in zip(self.commands, base, strict=True)]
-                    for s in (0.0, _STEP)]  # fmt: skip
+                    for s in (0.0, _CLOCK_STEP)]  # fmt: skip
             # [2, R, K, N, nu] to [K, N, nu, 2, R]
             ctrl = np.moveaxis(np.array(pair), (0, 1), (3, 4))
             drive = replace(drive, ctrl=ctrl)
@@ -269,6 +271,8 @@ class FitProblem:
             shift = _STEP * np.eye(START)[k][None, :, None] * self.drive.resets[:, None]
             points.append(replace(point, starts=point.starts + shift))
         robots += [robots[0]] * (own + START)
+        singly = np.array([*(_CLOCK_STEP if n == "clock" else _STEP for n in self.local),
+                           *[_STEP] * START])  # fmt: skip
         tracks = self._simulate(robots, points)
         values, slopes = [], []
         for left in self.residuals(tracks):
@@ -276,7 +280,7 @@ class FitProblem:
             known = np.where(np.abs(left) < _DIVERGED / 10, left, np.nan)
             up, down, rest = np.split(known[1:], [count, 2 * count])
             both = np.moveaxis(up - down, 0, -1) / (2 * steps)
-            one = np.moveaxis(rest - known[0], 0, -1) / _STEP
+            one = np.moveaxis(rest - known[0], 0, -1) / singly
             slopes.append(np.concatenate([both, one], -1))
         return values, slopes, tracks[0]
 
