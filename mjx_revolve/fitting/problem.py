@@ -53,7 +53,7 @@ _RECORD = 0.01
 # known of them, and near it by what they are uncertain by, as over more than that the motion of a
 # robot that tumbles is not linear, and its mean gradient is another one. Choices.
 _STEP, _FREE_STEP, _FREE_SHARE, _FINEST = 1e-3, 0.02, 0.2, 1e-4
-# Of a clock, two of the usual steps: over less, jumps of held commands are its slope [s].
+# Of a clock, two of the usual steps: over less, held commands would make jumps of it [s].
 _CLOCK_STEP = 0.01
 # The search begins with windows that are so many times shorter: a robot that tumbles for seconds
 # leads a search that begins far from its numbers astray. A choice.
