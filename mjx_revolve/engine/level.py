@@ -42,7 +42,8 @@ class DragBound(NamedTuple):
         moment: Σ s x with the centres x of the parts' boxes [kg].
         inertia: Σ s (x² 1 - x xᵀ) [kg·m].
         corners: Σ s r with half the diagonals r of the boxes [kg].
-        mass: of the body, with the least that the water which its parts carry weighs [kg].
+        mass: of the body, with the least that the water which its parts carry weighs; less for a
+            body that turns easily for its mass [kg].
     """
 
     steep: Scalar

@@ -355,6 +355,9 @@ def _principal(assembly: Assembly) -> tuple[np.ndarray, np.ndarray]:
     return moments, axes
 
 
+# A uniform cube's inertia is .22 of its mass times the square of half its diagonal, and no body of
+# the catalogue's modules has less than .1. Below this share, it counts instead of the mass.
+_HEAVY_MIDDLE = 0.08
 # Steeper than any step can take explicitly, and its square is a float32; a choice.
 _UNBOUNDED = 1e9
 
@@ -387,6 +390,13 @@ def _read_bounds(
         mass = mass + np.bincount(table.body, least, len(mass))
         whole = mass[table.body]
         steep *= whole / (whole + thinness(2 * table.half_size) * more)
+    # What turns easily for its mass, as with ballast in its middle.
+    corner = np.linalg.norm(table.half_size, axis=1)
+    corner = corner + np.linalg.norm(table.position - assembly.center[table.body], axis=1)
+    reach = np.full(len(mass), 1e-9)
+    np.maximum.at(reach, table.body, corner)
+    turns = np.linalg.eigvalsh(assembly.inertia)[:, -1] / np.maximum(assembly.mass, 1e-12)
+    mass = mass * np.minimum(turns / (_HEAVY_MIDDLE * reach**2), 1)
     at = turned(frame[table.body].swapaxes(1, 2), table.position)
     x = _skews(at)
 

@@ -124,10 +124,7 @@ def everything(state, half):
 
 @jax.jit
 def table(depth, angle, half):
-    """Share and moment, and their slopes by depth and angle, of a row of depths.
-
-    The vertical is one that all three edges see, but for angle 0.
-    """
+    """Share, moment and slopes by depth and angle; all edges see the vertical but at angle 0."""
 
     def tilted(depth, angle):
         up = (0.6 * jnp.sin(angle), 0.8 * jnp.sin(angle), jnp.cos(angle))

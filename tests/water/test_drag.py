@@ -86,6 +86,14 @@ def test_a_jointed_body_slows_down_from_more_than_it_can_reach():
     assert np.linalg.norm(after[-1, :3], axis=0).max() < 0.3
 
 
+def test_a_shell_with_all_its_mass_in_the_middle_comes_to_rest():
+    robot = box_robot((0.1,) * 3, 0.002, world(drag="faces", timestep=0.01), ballast_mass=0.3)
+    qpos, qvel = at_rest(robot, 1, -20.0)
+    qvel[:, 0] = 0.3, 0.1, 0.0, 5.0, 1.5, 1.0
+    speeds = march(robot, 0.5, qpos, qvel)[2]
+    assert np.abs(speeds).max() < 5.1 and np.abs(speeds[-1, 3:]).max() < 0.1
+
+
 def test_a_body_that_displaces_nothing_has_the_inertia_boxs_drag():
     """Deep, with the law's whole force and torque; half in, half of them, as its box is."""
     size, mass = np.array([0.1, 0.06, 0.04]), 0.2

@@ -318,11 +318,7 @@ STD = np.array([0.3, 0.1, 0.02])
 @pytest.mark.slow
 @pytest.mark.parametrize("relative", [0.01, 0.1, 5.0])
 def test_gusts_have_the_mean_variance_and_memory_that_were_asked_for(relative):
-    """At any time step, within 4.5 standard errors of each estimate: 1 in 150,000 by chance.
-
-    Of n normal numbers the mean errs by σ/√n, the variance by σ²√(2/n), a correlation ρ by
-    √((1 + ρ²)/n).
-    """
+    """At any time step, within 4.5 standard errors of each estimate: 1 in 150,000 by chance."""
     gust, trials = Gust(tuple(STD), time=4.0), 3000
     steps = max(4, round(min(1.5 / relative, 1500)))
     path = gust_path(gust, jax.random.key(round(1e3 * relative)), steps, 4.0 * relative, trials)
