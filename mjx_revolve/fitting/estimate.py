@@ -26,8 +26,8 @@ _NEAR = 1.0
 FEW = 30
 """With fewer measurements of a kind, their noise is what is usual: a wrong model would else pass
 for noise; intervals are widened by what is left (Birge 1932). A choice."""
-# Clocks at which a search begins, too: two of the prior's standard deviations to both sides [s].
-_CLOCKS = (-0.1, -0.05, 0.05, 0.1)
+# Clocks at which a search begins: two of the prior's standard deviations to both sides [s].
+_CLOCKS = (0.0, -0.1, -0.05, 0.05, 0.1)
 _LEAST_NOISE = 0.02  # of `NOISE`: no recording is better, and what was simulated has none at all
 # In shorter windows correlation of neighbours may be chance. A choice [frames].
 _FEWEST_ROWS = 12.0
@@ -337,13 +337,14 @@ def begin(problem: FitProblem, seed: int) -> FitState:
     if (problem.short == problem.drive.resets).all():
         return first
     pieces = problem.in_pieces()
-    arrived = [_arrive(pieces, first)]
-    if "clock" in problem.local:  # a search finds a delay only from near it
-        clock = problem.local.index("clock")
-        for late in _CLOCKS:
-            local = best.local.copy()
-            local[:, clock] = late
-            arrived.append(_arrive(pieces, replace(first, point=replace(best, local=local))))
+    if "clock" not in problem.local:
+        return _arrive(pieces, first)
+    # A search finds a delay only from near it.
+    arrived, clock = [], problem.local.index("clock")
+    for late in _CLOCKS:
+        local = best.local.copy()
+        local[:, clock] = late
+        arrived.append(_arrive(pieces, replace(first, point=replace(best, local=local))))
     # One by one: points that are simulated together have one clock.
     totals = [recording_costs(pieces, [one.point], noise).sum() for one in arrived]
     return arrived[int(np.argmin(totals))]
