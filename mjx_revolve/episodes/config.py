@@ -306,6 +306,13 @@ class TaskConfig(Section):
     params: Annotated[dict[str, Any], File("data")] = Field({})
     """Settings of a function of the user's own, which reads them as `settings.params`."""
 
+    def energy_weight_over(self, seconds: float) -> float:
+        """`energy_weight` by which a rate loses as much in an episode of so many seconds [1/J].
+
+        Work grows with time, a rate does not.
+        """
+        return self.energy_weight * self.duration / seconds
+
     @model_validator(mode="after")
     def _check(self) -> TaskConfig:
         self.refuse_params(self.params)

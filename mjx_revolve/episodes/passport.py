@@ -332,8 +332,8 @@ def _scores(
 
     def spec(seconds: float) -> Fitness:
         changes = {"duration": seconds, "trials": _STARTS, "robust": None}
-        if fitness.task.unit.endswith("/s"):  # work grows with time, a rate does not
-            changes["energy_weight"] = fitness.settings.energy_weight * usual / seconds
+        if fitness.task.unit.endswith("/s"):
+            changes["energy_weight"] = fitness.settings.energy_weight_over(seconds)
         if seconds > usual:  # it is swum, not foretold
             changes["horizon"] = None
         task = fitness.settings.model_copy(update=changes)

@@ -107,8 +107,7 @@ class BodyFitness:
         swum: dict[str, Any] = {
             "task.duration": seconds, "task.horizon": None, "task.trials": _LONG_TRIALS,
             "task.robust": task.robust and task.robust.model_dump(),
-            # Work grows with time, a rate does not.
-            "task.energy_weight": task.energy_weight * task.duration / seconds,
+            "task.energy_weight": task.energy_weight_over(seconds),
         }  # fmt: skip
         usual, kept = (self._scores_with(bodies, genes, key, **x) for x in ({}, swum))
         return kept / np.maximum(usual, 1e-9)
@@ -216,7 +215,7 @@ def make_body_fitness(config: Config) -> BodyFitness:
         examples = [*seeds, *(genotype.develop(genotype.random(rng)) for _ in range(_EXAMPLES))]
         kinds = [modules[name] for name in (bodies.core, *bodies.modules)]
         there = [*kinds, *(module.kind for seed in seeds for module in seed.modules)]
-        if not any(kind.hinge or any(part.thruster for part in kind.parts) for kind in there):
+        if not any(kind.hinge or kind.is_thruster for kind in there):
             moving = "a type with a hinge or a thruster, as brains are to evolve"
             raise InputError("bodies.modules", moving, ", ".join(bodies.modules))
         mixed = make_mixed_fitness(

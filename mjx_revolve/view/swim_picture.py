@@ -101,11 +101,18 @@ def draw_motion(motion: Motion) -> Figure:
     figure.text(0.36 / width, line, _headline(motion), fontsize=17, color=INK, va="center")
     figure.text(1 - _RIGHT / width, line, _facts(motion), fontsize=12, color=_SOFT, ha="right",
                 va="center")  # fmt: skip
-    strip = motion.robot.num_hinges > 0 and len(motion.time) > 1
+    strip = bool(stroke_words(motion))
     _draw_way(figure, motion, 0.7 + (_STRIP + 0.65 if strip else 0.0))
     if strip:
         _draw_stroke(figure, motion)
     return figure
+
+
+def stroke_words(motion: Motion) -> str:
+    """What the strip of snapshots shows; nothing where there is none."""
+    if motion.robot.num_hinges == 0 or len(motion.time) < 2:
+        return ""
+    return "the last second" if motion.period is None else "one stroke"
 
 
 def _headline(motion: Motion) -> str:

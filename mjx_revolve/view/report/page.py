@@ -28,7 +28,6 @@ from mjx_revolve.inputs.trust import UntrustedError
 from mjx_revolve.view import convergence, motion_plots
 from mjx_revolve.view.colony_history import ColonyHistory
 from mjx_revolve.view.colony_pictures import plot_history
-from mjx_revolve.view.motion import Motion
 from mjx_revolve.view.plots import COLORS, figure_jpeg, figure_png, figure_svg, letter
 from mjx_revolve.view.report import tables
 from mjx_revolve.view.report.bodies import anchor, inline_svg, show_population, viewer_command
@@ -38,7 +37,7 @@ from mjx_revolve.view.report.record import RunRecord
 from mjx_revolve.view.report.repeat import environment, repeat_command, sources
 from mjx_revolve.view.sensor_plots import plot_sensors
 from mjx_revolve.view.statistics import COVERAGE
-from mjx_revolve.view.swim_picture import draw_motion
+from mjx_revolve.view.swim_picture import draw_motion, stroke_words
 
 GENERATOR = "mjx_revolve.report"  # identifies pages of this package
 
@@ -255,15 +254,8 @@ def _champion(record: RunRecord, replay: ChampionReplay | None) -> str:
     return sections.champion(
         robot.morphology.title, float(motion.time[-1]), motion.counted_from,
         origin if isinstance(origin, str) else "", tables.measures_table(record, replay),
-        record.passport.rows if record.passport is not None else [], pictures, _strip_words(motion),
+        record.passport.rows if record.passport is not None else [], pictures, stroke_words(motion),
     )  # fmt: skip
-
-
-def _strip_words(motion: Motion) -> str:
-    """What the strip below the picture of the way shows; nothing where there is none."""
-    if motion.robot.num_hinges == 0 or len(motion.time) == 1:
-        return ""
-    return "; below, the last second" if motion.period is None else "; below, one stroke"
 
 
 def svg_source(figure: Figure) -> str:
