@@ -6,9 +6,9 @@ drawn from the catalogue alone: the outer dimensions are those of a part's boxes
 dimension (a wall, a window, the height of the pads) is solved so that the mesh encloses the part's
 tabulated volume. A user's module type is drawn the same way.
 
-A shape is a list of bodies that touch and share no volume, such as the six walls of a hollow box,
-so that no boolean engine is needed. A body is swept through outlines of equally many points, the
-corners of a rectangle counting several times: every wall, with or without a window, is one sweep.
+A shape is a list of bodies that share no volume, so that no boolean engine is needed. A body is
+swept through outlines of equally many points, the corners of a rectangle counting several times; a
+hollow box is made of six such walls, with or without a window, open where they meet.
 
 The meshes are pictures: the centre of volume that the physics uses is the catalogue's.
 """
@@ -58,28 +58,42 @@ def _volume(bodies: Sequence[_Body]) -> float:
     return float(mass.volume)
 
 
-def _sweep(axis: int, *outlines: tuple[np.ndarray, float], closed: bool = False) -> _Body:
-    """Body through outlines.
+def _loops(axis: int, outlines: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
+    """`[k, n, 3]` outlines in space.
 
     Args:
         axis: normal to the outlines: 0, 1 or 2 for x, y, z; their own axes are the two next, in
             cyclic order.
         outlines: `[n, 2]` each [m], with its coordinate along the axis [m].
-        closed: join the last with the first, as around a hole; else both are filled.
     """
     order = np.argsort([axis, (axis + 1) % 3, (axis + 2) % 3])
-    loops = np.array([np.insert(line, 0, height, axis=1)[:, order] for line, height in outlines])
-    start, stop = (loops, np.roll(loops, -1, axis=0)) if closed else (loops[:-1], loops[1:])
+    return np.array([np.insert(line, 0, height, axis=1)[:, order] for line, height in outlines])
+
+
+def _sides(loops: np.ndarray) -> np.ndarray:
+    """Triangles between each outline and the next."""
+    start, stop = loops[:-1], loops[1:]
     after = np.roll(start, -1, axis=1), np.roll(stop, -1, axis=1)
     sides = [
         np.stack([start, after[0], stop], axis=2),
         np.stack([after[0], after[1], stop], axis=2),
     ]
-    triangles = [side.reshape(-1, 3, 3) for side in sides]
-    for loop, turn in () if closed else ((loops[0], -1), (loops[-1], 1)):
-        fan = np.stack([np.broadcast_to(loop[0], loop[2:].shape), loop[1:-1], loop[2:]], axis=1)
-        triangles.append(fan if turn > 0 else fan[:, ::-1])
-    body = np.concatenate(triangles)
+    return np.concatenate([side.reshape(-1, 3, 3) for side in sides])
+
+
+def _fan(loop: np.ndarray) -> np.ndarray:
+    """Triangles inside an outline."""
+    return np.stack([np.broadcast_to(loop[0], loop[2:].shape), loop[1:-1], loop[2:]], axis=1)
+
+
+def _sweep(axis: int, *outlines: tuple[np.ndarray, float], closed: bool = False) -> _Body:
+    """Body through outlines as of `_loops`.
+
+    Closed, the last joins the first, as around a hole; else both are filled.
+    """
+    loops = _loops(axis, (*outlines, outlines[0]) if closed else outlines)
+    ends = [] if closed else [_fan(loops[0])[:, ::-1], _fan(loops[-1])]
+    body = np.concatenate([_sides(loops), *ends])
     return body if _volume([body]) > 0.0 else body[:, ::-1]
 
 
@@ -131,17 +145,23 @@ def _shell(
         windows: for a face (axis, sign) the window's half widths along the two next axes in cyclic
             order, and the radius of its corners [m].
     """
-    outer = 0.5 * np.asarray(size)
-    inner = outer - wall
+    halves = 0.5 * np.asarray(size) - wall, 0.5 * np.asarray(size)
     walls = []
     for axis in range(3):
-        # Where two walls meet, the edge belongs to that of the later axis.
-        u, v = (outer[k] if k < axis else inner[k] for k in ((axis + 1) % 3, (axis + 2) % 3))
         for sign in (1, -1):
-            hole = _outline(*windows[axis, sign]) if (axis, sign) in windows else None
-            heights = sign * inner[axis], sign * outer[axis]
-            walls.append(_prism(axis, *heights, _outline(u, v), hole))
-    return walls
+            inner, outer = (
+                (_outline(half[(axis + 1) % 3], half[(axis + 2) % 3]), sign * half[axis])
+                for half in halves
+            )
+            if (axis, sign) in windows:
+                hole = _outline(*windows[axis, sign])
+                rims = (outer, (hole, outer[1]), (hole, inner[1]), inner)
+                wall_ = _sides(_loops(axis, rims))
+            else:
+                loops = _loops(axis, (outer, inner))
+                wall_ = np.concatenate([_fan(loops[0]), _fan(loops[1])[:, ::-1]])
+            walls.append(wall_ if sign > 0 else wall_[:, ::-1])
+    return [np.concatenate(walls)]
 
 
 def _crate(half: np.ndarray, wall: float, room: np.ndarray, round_: bool) -> list[_Body]:
@@ -200,7 +220,12 @@ def _frame(kind: ModuleType, part: Part) -> list[_Body] | None:
         arm = np.concatenate([round_[: len(round_) // 2], square[len(square) // 2 :]])
         hole = _outline(bore, bore, bore, (0.0, axis_x))
         arms = [_prism(1, *ends, arm, hole) for ends in ((inside, half_y), (-half_y, -inside))]
-        return [_prism(0, -half_x, base, _outline(half_y, half_z)), *arms]
+        plate = _outline(half_z, 0.5 * (base + half_x), 0.0, (0.0, 0.5 * (base - half_x)))
+        body = _sweep(1, *((plate, y) for y in (-half_y, -inside, inside, half_y)))
+        body = np.concatenate([body, *arms])
+        # Where an arm stands on the plate neither has a surface.
+        off, y = abs(body[..., 0] - base).max(axis=1), body[..., 1].mean(axis=1)
+        return [body[(off > 10.0**-_DIGITS) | (abs(y) <= inside)]]
 
     return _solve(build, 1e-3 * half_y, 0.999 * widest, part.volume)
 
@@ -392,6 +417,6 @@ def part_mesh(kind: ModuleType, part: Part) -> trimesh.Trimesh:
     """
     shape = _SHAPES.get((kind.name, part.name))
     bodies = shape(kind, part) if shape and part.volume > 0.0 else None
-    # Bodies that touch share no vertex: no edge has more than two faces.
+    # Bodies share no vertex: no edge has more than two faces.
     meshes = [_surface(body) for body in (_generic(part) if bodies is None else bodies)]
     return cast(trimesh.Trimesh, trimesh.util.concatenate(meshes))
