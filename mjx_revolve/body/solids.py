@@ -71,7 +71,7 @@ def _loops(axis: int, outlines: Sequence[tuple[np.ndarray, float]]) -> np.ndarra
 
 
 def _sides(loops: np.ndarray) -> np.ndarray:
-    """Triangles between each outline and the next."""
+    """`[m, 3, 3]` triangles between each outline of `[k, n, 3]` and the next."""
     start, stop = loops[:-1], loops[1:]
     after = np.roll(start, -1, axis=1), np.roll(stop, -1, axis=1)
     sides = [
@@ -82,7 +82,7 @@ def _sides(loops: np.ndarray) -> np.ndarray:
 
 
 def _fan(loop: np.ndarray) -> np.ndarray:
-    """Triangles inside an outline."""
+    """`[n - 2, 3, 3]` triangles inside an outline `[n, 3]`."""
     return np.stack([np.broadcast_to(loop[0], loop[2:].shape), loop[1:-1], loop[2:]], axis=1)
 
 
@@ -146,7 +146,7 @@ def _shell(
             order, and the radius of its corners [m].
     """
     halves = 0.5 * np.asarray(size) - wall, 0.5 * np.asarray(size)
-    walls = []
+    faces = []
     for axis in range(3):
         for sign in (1, -1):
             inner, outer = (
@@ -156,12 +156,12 @@ def _shell(
             if (axis, sign) in windows:
                 hole = _outline(*windows[axis, sign])
                 rims = (outer, (hole, outer[1]), (hole, inner[1]), inner)
-                wall_ = _sides(_loops(axis, rims))
+                face = _sides(_loops(axis, rims))
             else:
                 loops = _loops(axis, (outer, inner))
-                wall_ = np.concatenate([_fan(loops[0]), _fan(loops[1])[:, ::-1]])
-            walls.append(wall_ if sign > 0 else wall_[:, ::-1])
-    return [np.concatenate(walls)]
+                face = np.concatenate([_fan(loops[0]), _fan(loops[1])[:, ::-1]])
+            faces.append(face if sign > 0 else face[:, ::-1])
+    return [np.concatenate(faces)]
 
 
 def _crate(half: np.ndarray, wall: float, room: np.ndarray, round_: bool) -> list[_Body]:
