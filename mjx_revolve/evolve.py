@@ -129,19 +129,24 @@ def _lead(
     trust = arguments.trust
     config = _check(arguments, files=make_fitness is None)
     _say(plain(f"loading {folder or path}"))  # it takes seconds
+    count = 1
     if make_fitness is None and not arguments.cluster and runtime.expects_cpu():
-        # They import JAX and the rest while this process does.
         from mjx_revolve.evolution.executor import choose_workers
-        from mjx_revolve.evolution.processes import start_workers
 
         count = arguments.workers or choose_workers(config)
-        if count > 1:
-            started += start_workers(count, runtime.find_cache())
-        for worker in started:
-            executors.callback(worker.end)
-    runtime.prepare_process()
+    from mjx_revolve.evolution.processes import can_fork, start_workers
+
+    # A user's code may start threads when it is imported.
+    forks = can_fork() and not config.has_user_code
+    if count > 1 and not forks:  # they import JAX and the rest while this process does
+        started += start_workers(count, runtime.find_cache())
+    cache = runtime.prepare_process()
     from mjx_revolve.evolution.run import Run
 
+    if count > 1 and forks:
+        started += start_workers(count, cache, fork=True)
+    for worker in started:
+        executors.callback(worker.end)
     if folder is None:
         with opening_config(path, trust):
             run = Run.begin(path, settings, arguments.out, make, interrupts.writing)

@@ -275,10 +275,11 @@ class EpisodeSpec(ABC, Generic[B]):
     def program(self, population: jax.Array, key: jax.Array) -> PyTree:
         """A function of (bodies, population, key) that scores; compiled, unless it is traced."""
         check_key(key)
-        return self._score if is_traced(population, key) else self._jitted
+        return self._score if is_traced(population, key) else self.scorer
 
     @cached_property
-    def _jitted(self) -> Any:
+    def scorer(self) -> StoredProgram:
+        """What `program` compiles."""
         return self.keep(self._score, "score")
 
     def keep(

@@ -128,6 +128,10 @@ class Fitness(EpisodeSpec[tuple[()]]):
         population = self.check_population(population)
         return self.program(population, key)((), population, key)
 
+    def precompile(self, population: ArrayLike, key: jax.Array) -> None:
+        """Compiles `evaluate` for such a population, or reads its program, without an episode."""
+        self.scorer.precompile((), self.check_population(population), key)
+
     def bare_controller(self) -> Controller:
         """The controller for a real device: called at its rate, with readings of real sensors.
 
@@ -340,18 +344,30 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
             InputError: the numbers of bodies and of individuals differ, a body does not fit or is
                 none, or the key is none.
         """
+        bodies, populations = self._beside(robots, population)
+        found = self.program(populations, key)(bodies, populations, key)
+        single = np.ndim(population) < populations.ndim
+        return jax.tree.map(lambda x: x[0], found) if single else found
+
+    def precompile(
+        self, robots: Robot | Sequence[Robot] | PackedBodies, population: ArrayLike, key: jax.Array
+    ) -> None:
+        """Compiles `evaluate` for such arguments, or reads its program, without an episode."""
+        self.scorer.precompile(*self._beside(robots, population), key)
+
+    def _beside(
+        self, robots: Robot | Sequence[Robot] | PackedBodies, population: ArrayLike
+    ) -> tuple[PackedBodies, jax.Array]:
+        """Tables of bodies with their genes, as `_score` takes them."""
         population = self.check_population(population, (2, 3))
         if isinstance(robots, Robot):
             robots = self.pack([robots])
         count = robots.count.shape[-1] if isinstance(robots, PackedBodies) else len(robots)
-        single = population.ndim == 2 and isinstance(robots, PackedBodies) and count == 1
-        if single:
+        if population.ndim == 2 and isinstance(robots, PackedBodies) and count == 1:
             population = population[None]
         if count != len(population):
             raise InputError("robots", f"{len(population)}, one each", count)
-        bodies = robots if isinstance(robots, PackedBodies) else self.pack(robots)
-        found = self.program(population, key)(bodies, population, key)
-        return jax.tree.map(lambda x: x[0], found) if single else found
+        return robots if isinstance(robots, PackedBodies) else self.pack(robots), population
 
     def _score(self, bodies: PackedBodies, population: jax.Array, key: jax.Array) -> PyTree:
         starts, bodies = self.precise_starts(population, key), as_precise(bodies, population)

@@ -184,10 +184,17 @@ class BodyFitness:
         Returns:
             `[P]` scores and `[P]` measures.
         """
+        return self.mixed.evaluate(self._robots(which, bodies), genes, key)
+
+    def precompile(
+        self, genes: np.ndarray, which: np.ndarray, bodies: Sequence[Morphology], key: jax.Array
+    ) -> None:
+        """Compiles `evaluate` for such a block, or reads its program, without an episode."""
+        self.mixed.precompile(self._robots(which, bodies), genes, key)
+
+    def _robots(self, which: np.ndarray, bodies: Sequence[Morphology]) -> Robot | Sequence[Robot]:
         robots = [self.build(body) for body in bodies]
-        if self.one_body_per_block:
-            return self.mixed.evaluate(robots[0], genes, key)
-        return self.mixed.evaluate([robots[k] for k in which], genes, key)
+        return robots[0] if self.one_body_per_block else [robots[k] for k in which]
 
 
 def make_body_fitness(config: Config) -> BodyFitness:

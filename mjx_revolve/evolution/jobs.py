@@ -5,7 +5,6 @@ Imports stand inside functions: a worker's threads are set before NumPy and JAX 
 
 from __future__ import annotations
 
-import contextlib
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -49,7 +48,7 @@ class Limits:
     def timeout(self, times: Sequence[float]) -> float:
         """For the next block, by the times of those before it [s].
 
-        The first has as long as the example, which its worker has scored before it was ready.
+        The first has as long as a worker to be ready: that may have scored an example.
         """
         usual = self.factor * statistics.median(times) if times else self.ready
         return max(self.block, usual)
@@ -141,10 +140,11 @@ def open_job(job: Job, scratch: str | Path) -> Any:
     return job.make_fitness(make_config(settings, "/", source=job.source))
 
 
-def compile_job(job: Job, fitness: object) -> None:
+def compile_job(job: Job, fitness: Any) -> None:
     """Compiles a fitness; of a host's workers the first does, and the others read its cache.
 
-    What keeps its programs on disk has a lock for each: all workers read them at once.
+    What keeps its programs on disk has a lock for each: all workers read them at once, and none
+    needs to call them.
     """
     import jax
 
@@ -152,11 +152,11 @@ def compile_job(job: Job, fitness: object) -> None:
     from mjx_revolve.evolution.fingerprints import hash_text
 
     example = example_block(fitness, job.config["evolution"]["population_size"])
-    lock: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
-    if not job.keeps_programs:
-        name = hash_text(function_name(job.make_fitness), repr(job.config))
-        lock = runtime.compile_lock("job", name)
-    with lock:
+    if job.keeps_programs:
+        fitness.precompile(*example, jax.random.key(0))
+        return
+    name = hash_text(function_name(job.make_fitness), repr(job.config))
+    with runtime.compile_lock("job", name):
         evaluate_block(fitness, example, jax.random.key(0))
 
 

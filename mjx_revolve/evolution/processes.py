@@ -1,8 +1,9 @@
 """Workers on this machine: processes that score blocks, watched, and replaced when they are lost.
 
-They are plain processes that run `serve`, not forks: JAX's threads do not survive a fork, and a
-script that uses an executor needs no `if __name__ == "__main__"`. The job, blocks and scores pass
-through a pipe, pickled. A second pipe, standard input, ends when the process that started them
+They are plain processes that run `serve`: JAX's threads do not survive a fork, and a script that
+uses an executor needs no `if __name__ == "__main__"`. Only a command that has imported JAX, and has
+not used it yet, forks its first ones, which saves them their imports. The job, blocks and scores
+pass through a pipe, pickled. A second pipe, standard input, ends when the process that started them
 does, even by kill -9; they end with it. Workers ignore interrupts, which the run handles, so that
 the generation under way can be finished.
 """
@@ -19,6 +20,7 @@ import sys
 import tempfile
 import threading
 import time
+import traceback
 from collections import deque
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
@@ -119,6 +121,68 @@ def _work(channel: Connection) -> None:
 # ------------------------------------------------------------------ in the run's process
 
 
+def can_fork() -> bool:
+    """Whether this process may fork workers once it has imported what they need.
+
+    Where it had imported JAX before, that may have threads; other systems' libraries forbid forks.
+    """
+    return sys.platform == "linux" and "jax" not in sys.modules
+
+
+class _Fork:
+    """A process forked from this one, with as much of `subprocess.Popen` as is needed."""
+
+    def __init__(self, descriptor: int, log: int) -> None:
+        """Forks it; it serves at the pipe's end `descriptor`, and its output goes to `log`."""
+        theirs, ours = os.pipe()
+        self.stdin = open(ours, "wb", buffering=0)  # noqa: SIM115  (kept open)
+        self.returncode: int | None = None
+        sys.stdout.flush()
+        sys.stderr.flush()
+        try:
+            self.pid = os.fork()
+            if not self.pid:
+                self._serve(descriptor, theirs, log)
+        finally:
+            os.close(theirs)
+
+    @staticmethod
+    def _serve(descriptor: int, stdin: int, log: int) -> NoReturn:
+        """The forked process."""
+        try:
+            os.setpgid(0, 0)
+            signal.set_wakeup_fd(-1)
+            for source, place in ((stdin, 0), (log, 1), (log, 2)):
+                os.dup2(source, place)
+            # Pipes to other workers would outlive this process's parent.
+            os.closerange(3, descriptor)
+            os.closerange(descriptor + 1, os.sysconf("SC_OPEN_MAX"))
+            serve(descriptor)
+        except BaseException:
+            traceback.print_exc()
+            sys.stderr.flush()
+        finally:
+            os._exit(1)
+
+    def kill(self) -> None:
+        """Kills it, unless it has been waited for."""
+        if self.returncode is None:
+            os.kill(self.pid, signal.SIGKILL)
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Its exit code, negative for a signal; `subprocess.TimeoutExpired` after so long [s]."""
+        began = time.monotonic()
+        while self.returncode is None:
+            pid, status = os.waitpid(self.pid, 0 if timeout is None else os.WNOHANG)
+            if pid:
+                self.returncode = os.waitstatus_to_exitcode(status)
+            elif timeout is not None and time.monotonic() - began > timeout:
+                raise subprocess.TimeoutExpired("a worker", timeout)
+            else:
+                time.sleep(0.01)
+        return self.returncode
+
+
 class LocalWorker:
     """A worker process.
 
@@ -131,7 +195,9 @@ class LocalWorker:
         age: time spent on that block, as measured by the executor [s].
     """
 
-    def __init__(self, core: int | None, cache: Path | None) -> None:
+    process: subprocess.Popen[bytes] | _Fork
+
+    def __init__(self, core: int | None, cache: Path | None, fork: bool = False) -> None:
         """Starts the process, which waits for its job; OSError if the system refuses."""
         self.core = core
         self.ready = False
@@ -142,11 +208,14 @@ class LocalWorker:
         self.channel, theirs = Pipe()
         try:
             # A group of its own: Ctrl-C and Ctrl-Z at the terminal reach only the run's process.
-            self.process = subprocess.Popen(
-                [sys.executable, "-c", _PROGRAM, str(theirs.fileno()), *sys.path],
-                stdin=subprocess.PIPE, stdout=self._log, stderr=self._log,
-                pass_fds=[theirs.fileno()], process_group=0,
-            )  # fmt: skip
+            if fork:
+                self.process = _Fork(theirs.fileno(), self._log.fileno())
+            else:
+                self.process = subprocess.Popen(
+                    [sys.executable, "-c", _PROGRAM, str(theirs.fileno()), *sys.path],
+                    stdin=subprocess.PIPE, stdout=self._log, stderr=self._log,
+                    pass_fds=[theirs.fileno()], process_group=0,
+                )  # fmt: skip
         except OSError:
             self.channel.close()
             self._log.close()
@@ -184,13 +253,14 @@ class LocalWorker:
         self._log.close()
 
 
-def start_workers(count: int, cache: Path | None) -> list[LocalWorker]:
+def start_workers(count: int, cache: Path | None, fork: bool = False) -> list[LocalWorker]:
     """Starts workers, which import what they need and wait for a job.
 
     Args:
         count: number of workers. If there is one for each core, each is pinned to a core; fewer are
             not pinned, so that several runs on one host do not share the same cores.
         cache: the compilation cache's folder.
+        fork: from this process, with what it has imported; see `can_fork`.
 
     Raises:
         WorkerError: the system refuses to start so many.
@@ -200,7 +270,8 @@ def start_workers(count: int, cache: Path | None) -> list[LocalWorker]:
     workers: list[LocalWorker] = []
     try:
         for index in range(count):
-            workers.append(LocalWorker(cores[index % len(cores)] if pinned else None, cache))
+            core = cores[index % len(cores)] if pinned else None
+            workers.append(LocalWorker(core, cache, fork))
     except BaseException as error:
         for worker in workers:
             worker.end()

@@ -50,6 +50,10 @@ class StoredProgram:
         """Calls it."""
         return self._jitted(*args) if self._folder is None else self.load(*args)(*args)
 
+    def precompile(self, *args: PyTree) -> None:
+        """Compiles it for such arguments, or reads it; where nothing is kept, by calling it."""
+        self(*args) if self._folder is None else self.load(*args)
+
     @property
     def _folder(self) -> Path | None:
         """Where its executables are kept; None: nowhere."""

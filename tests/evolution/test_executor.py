@@ -340,9 +340,9 @@ sys.exit(run_command(lambda argv: evolve.main(argv, toys.make_slow), sys.argv[1:
 """
 
 
-def start(folder, *argv, **environment):
+def start(folder, *argv, script=SCRIPT, **environment):
     """The command in a process of its own, as from a terminal."""
-    (folder / "script.py").write_text(SCRIPT)
+    (folder / "script.py").write_text(script)
     path = f"{ROOT}{os.pathsep}{ROOT / 'tests'}"
     return subprocess.Popen(
         [sys.executable, str(folder / "script.py"), *map(str, argv)], cwd=folder, text=True,
@@ -386,6 +386,40 @@ def test_workers_do_not_outlive_their_leader(folder):
     process.kill()
     process.communicate(timeout=120)
     wait_for(lambda: not any(map(is_alive, workers)))
+
+
+FORKING = """
+import os, sys, time
+import numpy as np
+from mjx_revolve.evolution.executor import make_executor
+from mjx_revolve.evolution.processes import can_fork, start_workers
+
+assert can_fork()
+import jax, toys
+workers = start_workers(2, None, fork=True)
+with make_executor("toy.yaml", 2, toys.make_toy, started=workers) as executor:
+    population = np.random.default_rng(0).normal(size=(9, executor.num_genes))
+    first = executor(population, jax.random.key(0))
+    lost = workers[0]
+    os.kill(lost.process.pid, 9)
+    while lost in workers:
+        assert np.array_equal(executor(population, jax.random.key(0)), first)
+    alone = make_executor("toy.yaml", 1, toys.make_toy)
+    assert np.array_equal(alone(population, jax.random.key(0)), first)
+    print("pids", *(worker.process.pid for worker in workers), flush=True)
+    time.sleep(60)
+"""
+
+
+@needs_proc
+def test_forked_workers_score_are_replaced_and_end_with_their_leader(folder):
+    process = start(folder, script=FORKING)
+    pids = [int(pid) for pid in toys.read_until(process, "pids")[-1].split()[1:]]
+    assert len(pids) == 2 and all(map(is_alive, pids))
+    os.kill(pids[1], signal.SIGSTOP)  # it is not asked
+    process.kill()
+    process.communicate(timeout=120)
+    wait_for(lambda: not any(map(is_alive, pids)))
 
 
 def test_a_robot_does_not_depend_on_its_workers(tmp_path):
