@@ -6,23 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import (
-    OAR,
-    QUICK,
-    WATER,
-    arm_robot,
-    at_rest,
-    batch_engine,
-    body,
-    box_robot,
-    check_refused,
-    elbow_robot,
-    march,
-    random_states,
-    read,
-    sensed,
-    world,
-)
+import laboratory as lab
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.sensors import Sensor, SensorRow
 from mjx_revolve.control.readings import EpisodeContext
@@ -41,7 +25,7 @@ from references import mujoco_sensors
 DT, LANES = 1e-4, 2
 # A current along x, and one along y that fades to nothing 20 m down.
 SHEAR = {"velocity": (0.0, 0.5, 0.0), "depth": 20.0, "profile": "linear"}
-SEA = world(**WATER | {
+SEA = lab.world(**lab.WATER | {
     "current": (0.3, 0.0, 0.0), "shear": SHEAR, "bed": {"height": -9.0}, "timestep": DT,
 })  # fmt: skip
 TARGET = np.array([1.0, 2.0, -4.0])
@@ -54,12 +38,12 @@ ALONE = ("height", "climb", "altitude")
 
 @pytest.fixture(scope="module")
 def robot():
-    return build_robot(body("spider"), SEA)
+    return build_robot(lab.body("spider"), SEA)
 
 
 def moving(robot, seed):
     """Two states, a step apart: `[nq, lanes]`, `[nv, lanes]` twice, and the acceleration."""
-    model, (qpos, qvel) = robot.mj_model, random_states(robot, LANES, seed)
+    model, (qpos, qvel) = robot.mj_model, lab.random_states(robot, LANES, seed)
     qacc = 5 * np.random.default_rng(seed).normal(size=qvel.shape)
     after, speed = qpos.copy(), qvel + DT * qacc
     for lane in range(LANES):
@@ -71,7 +55,7 @@ def moving(robot, seed):
 
 def felt(engine_of, before, after, ctrl, signals=ASKED):
     cues = EpisodeContext(target=tuple(TARGET))
-    return sensed(engine_of, SEA, after, ctrl, signals, cues, before)
+    return lab.sensed(engine_of, SEA, after, ctrl, signals, cues, before)
 
 
 def expected(sensors, name):
@@ -144,10 +128,10 @@ def compare_bricks(place, source, sensors, lanes):
 @pytest.mark.slow
 def test_in_a_batch_of_different_bodies_they_feel_the_same(robot, spiders):
     before, after, ctrl, sensors = spiders
-    robots = [robot, elbow_robot(SEA)]
-    capacity = fit_capacity([*robots, arm_robot(SEA)], sites=("FixedBrick", "Fin"))
+    robots = [robot, lab.elbow_robot(SEA)]
+    capacity = fit_capacity([*robots, lab.arm_robot(SEA)], sites=("FixedBrick", "Fin"))
     signals = ("forces", "load", "each FixedBrick", "each Fin")
-    engine = lambda: batch_engine(robots, capacity, LANES)  # noqa: E731
+    engine = lambda: lab.batch_engine(robots, capacity, LANES)  # noqa: E731
     found, source = felt(engine, before, after, ctrl, signals)
     bricks = found.modules["each FixedBrick"]
     compare_bricks(bricks, source, sensors, [0])
@@ -168,7 +152,7 @@ body:
     2: {id: side, type: FixedBrick}
     3: {id: other, type: FixedBrick}
 """
-GROUND = world(gravity=9.81, bed={"height": -1.0})
+GROUND = lab.world(gravity=9.81, bed={"height": -1.0})
 STIFF = GROUND.bed.stiffness
 
 
@@ -181,14 +165,14 @@ def touched(engine_of, qpos, what):
             state = engine.init(qpos, jnp.zeros_like(qpos[1:]))
             return getattr(engine, what)(state, water_of(GROUND)), engine.plant.source
 
-        found = jax.jit(run, compiler_options=QUICK)(jnp.asarray(qpos, jnp.float64))
+        found = jax.jit(run, compiler_options=lab.QUICK)(jnp.asarray(qpos, jnp.float64))
         return jax.tree.map(np.asarray, found)
 
 
 @pytest.mark.parametrize("kind", ["population", pytest.param("mjx", marks=pytest.mark.slow)])
 def test_a_pads_cells_are_its_left_and_its_right_half(kind):
     """Deep in the bed, level; then rolled about the way in which the pad is attached."""
-    robot = build_robot(read(PADS), GROUND)
+    robot = build_robot(lab.read(PADS), GROUND)
     pad = robot.morphology.modules[2]
     assert pad.name == "pad"
     half = np.array(pad.kind.parts[0].boxes[0].size) / 2
@@ -212,10 +196,10 @@ def test_a_pads_cells_are_its_left_and_its_right_half(kind):
 def test_a_box_at_rest_presses_its_halves_by_their_levers():
     """A ballast of half the box's weight off its middle: the lever says how the halves share it."""
     ballast = {"ballast_mass": 0.5, "ballast_position": (0.05, 0.0, 0.0)}
-    robot = box_robot((0.2, 0.1, 0.05), 1.0, GROUND, **ballast)
+    robot = lab.box_robot((0.2, 0.1, 0.05), 1.0, GROUND, **ballast)
     weight = 1.5 * 9.81
     lever = weight * (0.5 + np.array([-1, 1]) * (0.5 * 0.05 / 1.5) / 0.2)
-    _, qpos, qvel, _ = march(robot, 1.0, *at_rest(robot, height=-1 + 0.025), every=200)
+    _, qpos, qvel, _ = lab.march(robot, 1.0, *lab.at_rest(robot, height=-1 + 0.025), every=200)
     assert np.abs(qvel[-1]).max() < 1e-6
     [cells], _ = touched(lambda: make_engine(robot), qpos[-1], "contact_by_half")
     # Half a millimetre deeper on one side, it stands a little aslant.
@@ -227,16 +211,16 @@ def test_a_box_at_rest_presses_its_halves_by_their_levers():
     ({"type": "touch"}, "0.at: expected the id of a module, as touch sits on one; found"),
 ])  # fmt: skip
 def test_sensors_that_cannot_sit_there(sensor, message):
-    check_refused(f"sensors.{message}", schema.read, SensorRow, [sensor], "sensors")
+    lab.check_refused(f"sensors.{message}", schema.read, SensorRow, [sensor], "sensors")
 
 
 def test_a_module_that_is_not_there_is_refused():
-    plant = plant_of(build_robot(read(PADS), GROUND))
+    plant = plant_of(build_robot(lab.read(PADS), GROUND))
     for sensor, message in (
         (Sensor(type="flow", at="tail"), "sensors.0.at: expected the id of a module; found 'tail'"),
         (Sensor(type="angle", at="hand"), "sensors.0.at: expected a module with a hinge, as angle"),
     ):
-        check_refused(message, make_observer, [sensor], DT, plant)
+        lab.check_refused(message, make_observer, [sensor], DT, plant)
     assert Sensor(type="flow", at=3).to_mapping() == {"type": "flow", "at": "3"}
 
 
@@ -273,7 +257,7 @@ def test_types_of_modules_bring_their_sensors(tmp_path):
 
 def test_a_runs_fingerprint_knows_the_sensors_of_types(tmp_path):
     """And runs from before there were any keep theirs."""
-    (tmp_path / "oar.yaml").write_text(OAR)
+    (tmp_path / "oar.yaml").write_text(lab.OAR)
     base = {
         "morphology": str(tmp_path / "oar.yaml"),
         "modules": str(tmp_path / "modules.yaml"),

@@ -8,23 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import (
-    OURS,
-    WATER,
-    WILD,
-    accelerate,
-    arm_robot,
-    at_rest,
-    body,
-    check_engines,
-    elbow_robot,
-    march,
-    oar_robot,
-    random_states,
-    read,
-    with_motors,
-    world,
-)
+import laboratory as lab
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.robot import build_robot
@@ -40,19 +24,19 @@ CURRENT = (0.2, -0.1, 0.05)
 
 
 # The BlueROV2 states its own drag, which MuJoCo lacks (`test_fossen`).
-REAL = [path for path in OURS + WILD if path.stem != "bluerov2"]
+REAL = [path for path in lab.OURS + lab.WILD if path.stem != "bluerov2"]
 
 
 def drawn(robot, lanes, seed=0, speed=1.0):
     """Random states far below the surface, and targets that saturate some servos."""
-    qpos, qvel = random_states(robot, lanes, seed=seed, speed=speed, depth=50.0)
+    qpos, qvel = lab.random_states(robot, lanes, seed=seed, speed=speed, depth=50.0)
     ctrl = np.random.default_rng(seed + 1).uniform(-1, 1, (robot.mj_model.nu, lanes))
     return qpos, qvel, ctrl
 
 
 def stock(robot):
     """The robot with MuJoCo's own servos, which have no top speed."""
-    return with_motors(robot, np.inf)
+    return lab.with_motors(robot, np.inf)
 
 
 def mujoco_model(robot, drag):
@@ -82,21 +66,21 @@ def relative(found, expected):
 def check_acceleration(robot, drag="off", lanes=32, error=1e-10, x64=True):
     states = drawn(robot, lanes)
     expected = mujoco_qacc(mujoco_model(robot, drag), *states)
-    assert relative(accelerate(robot, *states, x64=x64), expected).max() < error
+    assert relative(lab.accelerate(robot, *states, x64=x64), expected).max() < error
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("drag", MUJOCO_LAWS)
 def test_acceleration_is_mujocos(drag):
     """To rounding of float64, with a current as MuJoCo's wind."""
-    robot = stock(arm_robot(world(gravity=9.81, drag=drag, current=CURRENT)))
+    robot = stock(lab.arm_robot(lab.world(gravity=9.81, drag=drag, current=CURRENT)))
     check_acceleration(robot, drag)
 
 
 @pytest.mark.slow
 def test_acceleration_in_float32():
     """Within 1e-5, what the population works with."""
-    robot = stock(elbow_robot(world(gravity=9.81)))
+    robot = stock(lab.elbow_robot(lab.world(gravity=9.81)))
     check_acceleration(robot, error=2e-5, x64=False)
 
 
@@ -106,14 +90,14 @@ def test_acceleration_in_float32():
 def test_acceleration_of_real_bodies(path):
     """Every shipped and wild morphology in MuJoCo's inertia box, float32."""
     morphology = load_morphology(path, allow_overlap=True)
-    robot = stock(build_robot(morphology, world(gravity=9.81, drag="inertia_box")))
+    robot = stock(build_robot(morphology, lab.world(gravity=9.81, drag="inertia_box")))
     check_acceleration(robot, "inertia_box", lanes=16, error=2e-5, x64=False)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("drag", MUJOCO_LAWS)
 def test_acceleration_of_the_spider_in_float64(drag):
-    robot = stock(build_robot(body("spider"), world(gravity=9.81, drag=drag)))
+    robot = stock(build_robot(lab.body("spider"), lab.world(gravity=9.81, drag=drag)))
     check_acceleration(robot, drag, lanes=16)
 
 
@@ -128,7 +112,7 @@ body:
 
 def slanted(text):
     """A morphology whose modules are each turned by 20° more than the one before, any way round."""
-    morphology = read(text)
+    morphology = lab.read(text)
     modules = []
     for k, module in enumerate(morphology.modules):
         quat = np.zeros(4)
@@ -140,21 +124,21 @@ def slanted(text):
 
 def test_slanted_modules_have_mujocos_water():
     """Boxes that do not stand square on their bodies, and hinges that point anywhere."""
-    robot = stock(build_robot(slanted(LIMB), world(drag="ellipsoid", current=CURRENT)))
+    robot = stock(build_robot(slanted(LIMB), lab.world(drag="ellipsoid", current=CURRENT)))
     qpos, qvel, ctrl = drawn(robot, 8)
     expected = mujoco_qacc(mujoco_model(robot, "ellipsoid"), qpos, qvel, ctrl)
-    assert np.all(relative(accelerate(robot, qpos, qvel, ctrl), expected) < 1e-10)
+    assert np.all(relative(lab.accelerate(robot, qpos, qvel, ctrl), expected) < 1e-10)
 
 
 def test_slanted_modules_have_our_water():
     """A rigid body at the surface, its acceleration from the sum over its parts, in NumPy."""
     rigid = LIMB.replace("ActiveHinge", "FixedBrick")
-    robot = build_robot(slanted(rigid), world(**WATER | {"added_mass": False}))
+    robot = build_robot(slanted(rigid), lab.world(**lab.WATER | {"added_mass": False}))
     model, table, density = robot.mj_model, robot.fluid, robot.world.density
     faces = FACES.numbers(table, robot.world)
-    qpos, qvel = random_states(robot, 6)
+    qpos, qvel = lab.random_states(robot, 6)
     qpos[2] = np.linspace(-0.06, 0.06, 6)
-    found, data = accelerate(robot, qpos, qvel), mujoco.MjData(model)
+    found, data = lab.accelerate(robot, qpos, qvel), mujoco.MjData(model)
     for lane in range(6):
         data.qpos[:], data.qvel[:] = qpos[:, lane], qvel[:, lane]
         mujoco.mj_forward(model, data)
@@ -193,17 +177,17 @@ body:
       1: {id: c, type: ActiveHinge}, 2: {id: d, type: ActiveHinge}, 3: {id: e, type: ActiveHinge},
     }}}}
 """
-    robot = stock(build_robot(read(text), world(gravity=9.81)))
+    robot = stock(build_robot(lab.read(text), lab.world(gravity=9.81)))
     check_acceleration(robot, lanes=16)
 
 
 @pytest.mark.parametrize("drag", ["off", pytest.param("inertia_box", marks=pytest.mark.slow)])
 def test_trajectory_is_mujocos(drag):
     """300 steps of `mj_step`, joints within their limits: Euler with implicit joint damping."""
-    robot = stock(elbow_robot(world(gravity=9.81, drag=drag)))
+    robot = stock(lab.elbow_robot(lab.world(gravity=9.81, drag=drag)))
     qpos, qvel, ctrl = drawn(robot, 6, speed=0.5)
     ctrl *= 0.4
-    _, q, v, _ = march(robot, 1.5, qpos, qvel, ctrl)
+    _, q, v, _ = lab.march(robot, 1.5, qpos, qvel, ctrl)
     check_mujocos_steps(mujoco_model(robot, drag), qpos, qvel, ctrl, (q, v), (1e-6, 1e-5))
     assert np.all(np.abs(q[:, 7:]) < np.pi / 4)
 
@@ -212,13 +196,13 @@ def test_trajectory_is_mujocos(drag):
 BEDDED = {"bed": Bed(kind="flat", height=-0.3), "current": (0.1, 0.0, 0.0)}
 FIN = "body: {type: Core, children: {0: {type: ActiveHinge, children: {1: {type: Fin}}}}}"
 FULL = {
-    "core": (partial(build_robot, body("core")), {"current": CURRENT}),
-    "bed": (oar_robot, BEDDED),
-    "auv": (partial(build_robot, body("auv")), {"current": CURRENT}),
-    "fin": (partial(build_robot, read(FIN)), {"current": CURRENT}),
-    "ellipsoid": (oar_robot, {"drag": "ellipsoid"}),
-    "plates": (oar_robot, {"drag": "lift_drag", "buoyancy": "mask", "current": CURRENT}),
-    "two hinges": (elbow_robot, BEDDED),
+    "core": (partial(build_robot, lab.body("core")), {"current": CURRENT}),
+    "bed": (lab.oar_robot, BEDDED),
+    "auv": (partial(build_robot, lab.body("auv")), {"current": CURRENT}),
+    "fin": (partial(build_robot, lab.read(FIN)), {"current": CURRENT}),
+    "ellipsoid": (lab.oar_robot, {"drag": "ellipsoid"}),
+    "plates": (lab.oar_robot, {"drag": "lift_drag", "buoyancy": "mask", "current": CURRENT}),
+    "two hinges": (lab.elbow_robot, BEDDED),
 }
 
 
@@ -228,21 +212,21 @@ FULL = {
 def test_the_two_engines_agree(case):
     """Through the surface, half a second in float64; beyond its range a servo stops."""
     make, fields = FULL[case]
-    robot = make(world(**WATER | fields))
+    robot = make(lab.world(**lab.WATER | fields))
     qpos, qvel, ctrl = drawn(robot, 4, speed=0.3)
     qpos[2] = [-0.2, -0.05, 0.0, 0.1]
     ctrl[:, 1] *= 3.0
-    check_engines(robot, qpos, qvel, ctrl)
+    lab.check_engines(robot, qpos, qvel, ctrl)
 
 
 @pytest.mark.slow
 def test_joints_stop_at_their_limits():
     """Neither target nor swing takes a hinge past its end by more than a fraction of a degree."""
-    robot = elbow_robot(world())
-    qpos, qvel = at_rest(robot, 2)
+    robot = lab.elbow_robot(lab.world())
+    qpos, qvel = lab.at_rest(robot, 2)
     qvel[6:, 0], qvel[6:, 1] = 8.0, -8.0
     ctrl = np.tile([[2.0, -2.0]], (robot.num_hinges, 1))
-    _, q, v, _ = march(robot, 2.0, qpos, qvel, ctrl)
+    _, q, v, _ = lab.march(robot, 2.0, qpos, qvel, ctrl)
     assert np.abs(q[:, 7:]).max() < np.pi / 4 + np.radians(0.5)
     assert np.abs(q[-1, 7:]) == pytest.approx(np.pi / 4, abs=1e-3)
     assert np.abs(v[-1, 6:]).max() < 1e-3
@@ -250,10 +234,10 @@ def test_joints_stop_at_their_limits():
 
 def test_power_is_what_the_servos_deliver():
     """|torque × speed| summed over the hinges, the torque within the servo's effort."""
-    robot = stock(elbow_robot(world()))
-    qpos, qvel = at_rest(robot, 2)
+    robot = stock(lab.elbow_robot(lab.world()))
+    qpos, qvel = lab.at_rest(robot, 2)
     ctrl = np.array([[0.5, -0.05], [-0.03, 0.7]])
-    time, q, v, worked = march(robot, 0.3, qpos, qvel, ctrl)
+    time, q, v, worked = lab.march(robot, 0.3, qpos, qvel, ctrl)
     model = robot.mj_model
     angle = np.concatenate([qpos[None, 7:], q[:-1, 7:]])
     speed = np.concatenate([qvel[None, 6:], v[:-1, 6:]])
@@ -266,26 +250,26 @@ def test_power_is_what_the_servos_deliver():
 def test_lanes_do_not_know_of_each_other(elbow):
     """A lane's bits depend neither on where it stands nor on a neighbour that blew up."""
     qpos, qvel, ctrl = drawn(elbow, 8)
-    _, q, v, _ = march(elbow, 0.5, qpos, qvel, ctrl)
+    _, q, v, _ = lab.march(elbow, 0.5, qpos, qvel, ctrl)
     assert np.all(np.isfinite(v))
     sick = qvel.copy()
     sick[3, 5] = np.nan
-    _, sick_q, sick_v, _ = march(elbow, 0.5, qpos, sick, ctrl)
+    _, sick_q, sick_v, _ = lab.march(elbow, 0.5, qpos, sick, ctrl)
     others = np.arange(8) != 5
     assert np.all(np.isnan(sick_v[-1, :6, 5]))
     assert np.array_equal(sick_q[..., others], q[..., others])
     assert np.array_equal(sick_v[..., others], v[..., others])
     turned = np.roll(np.arange(8), 3)
-    _, rolled, _, _ = march(elbow, 0.5, qpos[:, turned], qvel[:, turned], ctrl[:, turned])
+    _, rolled, _, _ = lab.march(elbow, 0.5, qpos[:, turned], qvel[:, turned], ctrl[:, turned])
     assert np.array_equal(rolled, q[..., turned])
 
 
 def test_the_water_may_differ_between_lanes():
     """Each lane's surface and current are its own."""
-    robot = build_robot(body("core"), world(gravity=9.81, buoyancy="partial", drag="faces"))
-    qpos, qvel = at_rest(robot, 3, -1.0)
+    robot = build_robot(lab.body("core"), lab.world(gravity=9.81, buoyancy="partial", drag="faces"))
+    qpos, qvel = lab.at_rest(robot, 3, -1.0)
     water = Water(np.array([0.0, -9.0, 0.0]), (np.array([0.0, 0.0, 0.3]), 0.0, 0.0))
-    qacc = accelerate(robot, qpos, qvel, water=water)
+    qacc = lab.accelerate(robot, qpos, qvel, water=water)
     sunk = -9.81 * (1 - 999.1026 * 5.054e-5 / 0.09)
     assert qacc[2] == pytest.approx([sunk, -9.81, sunk])
     drag = 0.5 * 999.1026 * 1.05 * 0.089 * 0.045 * 0.3**2 / 0.09
@@ -297,10 +281,10 @@ def test_convergence_in_the_time_step():
     """After half a second: what changes when the step halves, halves too, or better."""
     ends = []
     for dt in (0.004, 0.002, 0.001):
-        robot = build_robot(body("core"), world(**WATER, timestep=dt))
-        qpos, qvel = at_rest(robot, 2, -0.5)
+        robot = build_robot(lab.body("core"), lab.world(**lab.WATER, timestep=dt))
+        qpos, qvel = lab.at_rest(robot, 2, -0.5)
         qpos[2, 1], qvel[:6] = 0.0, 0.2
-        ends.append(march(robot, 0.5, qpos, qvel, every=round(0.1 / dt))[1][-1])
+        ends.append(lab.march(robot, 0.5, qpos, qvel, every=round(0.1 / dt))[1][-1])
     ratio = np.linalg.norm(ends[1] - ends[0]) / np.linalg.norm(ends[2] - ends[1])
     assert ratio > 1.7
 

@@ -8,23 +8,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from laboratory import (
-    QUICK,
-    SLOPE,
-    USUAL,
-    WATER,
-    accelerate,
-    arm_robot,
-    at_rest,
-    body,
-    box_robot,
-    limp,
-    march,
-    oar_robot,
-    random_states,
-    read,
-    world,
-)
+import laboratory as lab
 from mjx_revolve.body.morphology import trim_neutral
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.simulate import simulate
@@ -49,9 +33,9 @@ def test_a_limp_jointed_body_keeps_energy_and_impulse():
     """
     lost = []
     for dt in (0.0025, 0.00125):
-        robot = limp(arm_robot(world(added_mass=True, timestep=dt)))
-        qpos, qvel = random_states(robot, 8, speed=0.2)
-        _, q, v, _ = march(robot, 1.0, qpos, qvel, every=round(0.1 / dt))
+        robot = lab.limp(lab.arm_robot(lab.world(added_mass=True, timestep=dt)))
+        qpos, qvel = lab.random_states(robot, 8, speed=0.2)
+        _, q, v, _ = lab.march(robot, 1.0, qpos, qvel, every=round(0.1 / dt))
         lagrangian = Lagrangian(robot, RHO)
         energies = [each_lane(lagrangian.energy, *s) for s in zip(q, v, strict=True)]
         momenta = [each_lane(lagrangian.impulse, *s) for s in zip(q, v, strict=True)]
@@ -68,10 +52,10 @@ def test_a_limp_jointed_body_keeps_energy_and_impulse():
 @pytest.mark.slow
 def test_servos_give_no_more_energy_than_they_deliver():
     """At the default step, without drag, from a tumble of 1 m/s: start + work bounds the energy."""
-    robot = arm_robot(world(added_mass=True))
-    qpos, qvel = random_states(robot, 16, speed=1.0)
+    robot = lab.arm_robot(lab.world(added_mass=True))
+    qpos, qvel = lab.random_states(robot, 16, speed=1.0)
     ctrl = np.random.default_rng(1).uniform(-0.6, 0.6, (robot.num_hinges, 16))
-    _, q, v, work = march(robot, 2.0, qpos, qvel, ctrl, every=20)
+    _, q, v, work = lab.march(robot, 2.0, qpos, qvel, ctrl, every=20)
     lagrangian = Lagrangian(robot, RHO)
     start = each_lane(lagrangian.energy, qpos, qvel)
     for *state, done in zip(q, v, np.cumsum(work, 0), strict=True):
@@ -108,14 +92,14 @@ def test_a_stroke_in_the_default_water_is_of_second_order(name, strokes):
     """
     marched = {}
     for dt in (0.01, 0.005, 0.000625):
-        tank = world(drag="cross_flow", added_mass=True, timestep=dt)
-        robot = build_robot(trim_neutral(body(name), RHO), tank)
+        tank = lab.world(drag="cross_flow", added_mass=True, timestep=dt)
+        robot = build_robot(trim_neutral(lab.body(name), RHO), tank)
         longest = max(seconds for _, _, seconds, _, _ in strokes)
         steps = dt * np.arange(round(longest / dt))[:, None]
         lag = np.arange(robot.num_hinges)
         ctrl = [x * np.minimum(steps, 1) * wave(2 * np.pi * steps, lag) for x, wave, *_ in strokes]
-        states = at_rest(robot, len(strokes), -5.0)
-        _, marched[dt], _, _ = march(robot, longest, *states, np.stack(ctrl, -1))
+        states = lab.at_rest(robot, len(strokes), -5.0)
+        _, marched[dt], _, _ = lab.march(robot, longest, *states, np.stack(ctrl, -1))
     for lane, (_, _, seconds, most, gain) in enumerate(strokes):
         ends = [q[round(seconds / dt) - 1, :3, lane] for dt, q in marched.items()]
         way = np.linalg.norm(ends[-1] - [0, 0, -5])
@@ -126,10 +110,10 @@ def test_a_stroke_in_the_default_water_is_of_second_order(name, strokes):
 def test_a_neutral_body_goes_with_the_water_whatever_its_shape():
     """Without drag; pressure and carried water move it as they would the water in its place."""
     gust = {"std": [0.2, 0.1, 0.1], "time": 0.5}
-    tank = world(added_mass=True, buoyancy="partial", gravity=G, gust=gust, current=(0.3, 0, 0))
+    tank = lab.world(added_mass=True, buoyancy="partial", gravity=G, gust=gust, current=(0.3, 0, 0))
     size = (0.2, 0.1, 0.02)
-    robot = box_robot(size, RHO * np.prod(size), tank)
-    qpos, _ = random_states(robot, 1, seed=3)
+    robot = lab.box_robot(size, RHO * np.prod(size), tank)
+    qpos, _ = lab.random_states(robot, 1, seed=3)
     with jax.enable_x64(True):
         path, water = gusty(tank, 0, 2.0)
         start = np.concatenate([path[0] + tank.current, np.zeros(3)])
@@ -149,8 +133,8 @@ def test_gusts_move_a_heavy_body_less():
     gust = {"std": 0.2, "time": 0.5}
     for added_mass, error in ((False, 1e-12), (True, 1e-4)):
         # Without weight, or it would fall at several metres per second.
-        tank = world(added_mass=added_mass, buoyancy="partial", gust=gust)
-        robot = box_robot(CUBE, 2.0, tank)
+        tank = lab.world(added_mass=added_mass, buoyancy="partial", gust=gust)
+        robot = lab.box_robot(CUBE, 2.0, tank)
         with jax.enable_x64(True):
             path, water = gusty(tank, 1, 1.0)
             start = robot.start_qpos(5.0)
@@ -164,14 +148,14 @@ def test_gusts_move_a_heavy_body_less():
 def test_a_floating_box_goes_with_a_long_wave():
     """Its height is the surface's where it is, its velocity the water's, its deck level with it."""
     amplitude, length = 0.2, 40.0
-    tank = world(**WATER, waves=[{"amplitude": amplitude, "wavelength": length}])
+    tank = lab.world(**lab.WATER, waves=[{"amplitude": amplitude, "wavelength": length}])
     size = (0.2, 0.2, 0.06)
-    robot = box_robot(size, RHO * np.prod(size) / 2, tank)
+    robot = lab.box_robot(size, RHO * np.prod(size) / 2, tank)
     k = 2 * np.pi / length
     omega = np.sqrt(G * k)
-    qpos, qvel = at_rest(robot, 1, amplitude)
+    qpos, qvel = lab.at_rest(robot, 1, amplitude)
     qvel[0] = amplitude * omega
-    time, q, v, _ = march(robot, 10.0, qpos, qvel, every=10)
+    time, q, v, _ = lab.march(robot, 10.0, qpos, qvel, every=10)
     theta = k * q[:, 0, 0] - omega * time
     # Of second order, k a = 0.03, is what linear theory and a body of finite size leave out.
     assert q[:, 2, 0] == pytest.approx(amplitude * np.cos(theta), abs=0.03 * amplitude)
@@ -186,13 +170,13 @@ def test_a_floating_box_goes_with_a_long_wave():
 def test_entrained_water_is_mass_without_weight():
     """A box flooded to 70 % moves as one that is heavier by that water, spread evenly over it."""
     size, mass, volume, share = (0.2, 0.1, 0.06), 0.4, 3e-4, 0.7
-    tank = world(added_mass=True, drag="faces")
-    flooded = box_robot(size, mass, tank, volume, entrained_water=share)
+    tank = lab.world(added_mass=True, drag="faces")
+    flooded = lab.box_robot(size, mass, tank, volume, entrained_water=share)
     inside = RHO * share * (np.prod(size) - volume)
-    heavy = box_robot(size, mass + inside, tank, volume)
-    states = random_states(flooded, 16, speed=0.5)
-    _, q, v, _ = march(flooded, 1.0, *states)
-    _, other_q, other_v, _ = march(heavy, 1.0, *states)
+    heavy = lab.box_robot(size, mass + inside, tank, volume)
+    states = lab.random_states(flooded, 16, speed=0.5)
+    _, q, v, _ = lab.march(flooded, 1.0, *states)
+    _, other_q, other_v, _ = lab.march(heavy, 1.0, *states)
     assert q == pytest.approx(other_q, abs=1e-9)
     assert v == pytest.approx(other_v, abs=1e-9)
     assert inside > mass
@@ -202,7 +186,7 @@ def winged(switch, tank):
     """A core with a brick at either side, to which the switch belongs."""
     text = "body: {type: Core, children: {"
     text += ", ".join(f"{k}: {{type: FixedBrick, params: {{{switch}}}}}" for k in (2, 3)) + "}}"
-    return build_robot(read(text), tank)
+    return build_robot(lab.read(text), tank)
 
 
 SWITCHES = {
@@ -214,7 +198,7 @@ SWITCHES = {
 @lru_cache
 def switched(switch):
     """A robot that compiles once, and its parts without the switch."""
-    tank = world(**WATER)
+    tank = lab.world(**lab.WATER)
     return winged(SWITCHES[switch], tank), winged("", tank).fluid
 
 
@@ -224,7 +208,7 @@ def switched(switch):
 def test_switches_of_single_modules(switch, height, speed):
     """At rest half out of the water, deep at speed: summed by hand over what takes part."""
     robot, plain = switched(switch)
-    qpos, qvel = at_rest(robot, 1, height)
+    qpos, qvel = lab.at_rest(robot, 1, height)
     qvel[2] = speed
     mass, wings = robot.mj_model.body_mass.sum(), np.array([False, True, True])
     half = plain.half_size[:, 2]
@@ -237,20 +221,20 @@ def test_switches_of_single_modules(switch, height, speed):
     force = RHO * G * on("buoyancy") @ plain.volume - mass * G
     force -= on("drag") @ drag[:, 2] * speed * abs(speed)
     carried = RHO * on("added_mass") @ plain.added_mass[:, 2]
-    found = accelerate(robot, qpos, qvel)[:, 0]
+    found = lab.accelerate(robot, qpos, qvel)[:, 0]
     assert found[2] == pytest.approx(force / (mass + carried), rel=1e-9)
     assert found[[0, 1, 3, 4, 5]] == pytest.approx(0.0, abs=1e-9)
     if speed == 0:
-        after = march(robot, 0.01, qpos, qvel)[2]
+        after = lab.march(robot, 0.01, qpos, qvel)[2]
         assert after[0, 2, 0] / 0.005 == pytest.approx(force / (mass + carried), rel=1e-9)
 
 
 def test_what_a_world_switches_off_stays_off():
     """A module may not turn a law on that its world has turned off."""
-    robot = winged("buoyancy: partial, drag: faces, added_mass: true", world(gravity=G))
-    qpos, qvel = at_rest(robot, 1, -2.0)
+    robot = winged("buoyancy: partial, drag: faces, added_mass: true", lab.world(gravity=G))
+    qpos, qvel = lab.at_rest(robot, 1, -2.0)
     qvel[2] = -0.5
-    assert accelerate(robot, qpos, qvel)[:, 0] == pytest.approx([0, 0, -G, 0, 0, 0], abs=1e-12)
+    assert lab.accelerate(robot, qpos, qvel)[:, 0] == pytest.approx([0, 0, -G, 0, 0, 0], abs=1e-12)
 
 
 def test_ballast_in_the_keel_rights_a_body():
@@ -261,9 +245,9 @@ def test_ballast_in_the_keel_rights_a_body():
     ω² = m g (z_b - z) / (I + A' - (m z)² / (m + A)). Semi-implicit Euler errs by (ω dt)² / 24.
     """
     size, hull, lead, low, high = (0.2, 0.1, 0.06), 0.5, 0.3, -0.025, 0.005
-    tank = world(gravity=G, buoyancy="partial", added_mass=True)
+    tank = lab.world(gravity=G, buoyancy="partial", added_mass=True)
     mass = hull + lead
-    robot = box_robot(
+    robot = lab.box_robot(
         size, hull, tank, mass / RHO, center_of_volume=(0, 0, high), ballast_mass=lead,
         ballast_position=(0, 0, low),
     )  # fmt: skip
@@ -273,15 +257,15 @@ def test_ballast_in_the_keel_rights_a_body():
         inertia = hull / 12 * np.sum(np.square(edges)) + lead * low**2 + RHO * turning[axis]
         inertia -= (mass * z) ** 2 / (mass + RHO * added[sideways])
         omega = np.sqrt(mass * G * (high - z) / inertia)
-        qpos, qvel = at_rest(robot, 1, -5.0)
+        qpos, qvel = lab.at_rest(robot, 1, -5.0)
         qpos[3], qpos[4 + axis] = np.cos(0.01), np.sin(0.01)
-        time, q, _, _ = march(robot, 3.0, qpos, qvel)
+        time, q, _, _ = lab.march(robot, 3.0, qpos, qvel)
         angle = 2 * np.arcsin(q[:, 4 + axis, 0])
         assert omega * 3.0 / (2 * np.pi) > 0.5
         assert angle == pytest.approx(0.02 * np.cos(omega * time), abs=0.02 * 0.04)
 
 
-def check_slope(robot, *cases, kinks=(), compiled=QUICK):
+def check_slope(robot, *cases, kinks=(), compiled=lab.QUICK):
     """In float64, a rollout's gradient against differences over 2 µ, one-sided at `kinks`."""
     steps = 20
 
@@ -301,7 +285,7 @@ def check_slope(robot, *cases, kinks=(), compiled=QUICK):
         "current": np.zeros(3), "time": 0.0,
     }  # fmt: skip
     value = jax.jit(end, compiler_options=compiled)
-    slope = jax.jit(jax.grad(end), compiler_options=SLOPE)
+    slope = jax.jit(jax.grad(end), compiler_options=lab.SLOPE)
     for case in kinks:
         with jax.enable_x64(True):
             found = slope(jax.tree.map(jnp.asarray, usual | case))
@@ -327,7 +311,7 @@ def test_gradient_at_rest_and_at_the_waterline():
     And a core's centre in the surface, or while it drops through it, as users compile it. Where its
     deck or its keel just touches, the submerged share has its kinks.
     """
-    robot = build_robot(trim_neutral(body("core"), RHO), world(**WATER))
+    robot = build_robot(trim_neutral(lab.body("core"), RHO), lab.world(**lab.WATER))
     waterline = {"place": np.array([0.0, 0.0, -0.001]), "qvel": np.full(6, 0.05)}
     drop = {
         "place": np.array([0.0, 0.0, 0.04]),
@@ -335,14 +319,14 @@ def test_gradient_at_rest_and_at_the_waterline():
         "current": np.array([0.1, 0.0, 0.0]),
     }
     kinks = [{"place": np.array([0.0, 0.0, z])} for z in (0.0, 0.0225, -0.0225)]
-    check_slope(robot, {}, waterline, drop, kinks=kinks, compiled=USUAL)
+    check_slope(robot, {}, waterline, drop, kinks=kinks, compiled=lab.USUAL)
 
 
 @pytest.mark.long
 def test_gradient_in_waves_and_in_contact():
     """In the moment at which the sea is met, too; and sliding over a deep bed, corners in it."""
-    tank = world(
-        **WATER,
+    tank = lab.world(
+        **lab.WATER,
         waves=[{"amplitude": 0.05, "wavelength": 2.0, "direction": 0.5}],
         bed=Bed(kind="flat", height=-6.0),
     )
@@ -354,7 +338,7 @@ def test_gradient_in_waves_and_in_contact():
         "place": np.array([0.0, 0.0, -6.0 + 0.0215]),
         "qvel": np.array([0.1, 0.05, -0.02, 0.1, 0.05, 0.2]),
     }
-    check_slope(build_robot(body("core"), tank), afloat, sliding)
+    check_slope(build_robot(lab.body("core"), tank), afloat, sliding)
 
 
 @pytest.mark.long
@@ -367,11 +351,11 @@ def test_gradient_of_a_jointed_body():
         # Not the body's own speed: there |v|, of which drag's implicit part is made, has its kink.
         "current": np.array([0.12, 0.0, 0.0]),
     }
-    check_slope(oar_robot(world(**WATER)), inputs)
+    check_slope(lab.oar_robot(lab.world(**lab.WATER)), inputs)
 
 
 @pytest.mark.long
 def test_gradient_through_thrusters():
     """In the commands, behind their lag; one of them stands still."""
     inputs = {"ctrl": np.array([0.5, -0.3, 0.0, 0.8]), "qvel": np.full(6, 0.05)}
-    check_slope(build_robot(body("auv"), world(**WATER)), inputs)
+    check_slope(build_robot(lab.body("auv"), lab.world(**lab.WATER)), inputs)
