@@ -59,9 +59,10 @@ _WORD = 32
 _FAR = 1e3
 # What no contact needs, and what stands for the need of those that push already [m/s²].
 _NONE, _KEPT = -1e9, 1e9
-# Overlap that is tolerated [m], also where there is none at rest, the share of the rest that is
-# removed in a step, and the top speed of that [m/s]. Choices.
-_SLOP, _SHARE, _TOP = 5e-4, 1.0, 1.0
+# Overlap that is tolerated [m]: that at rest, at least and at most so much. Choices: with half a
+# millimetre less at most, what stands between two that it overlaps at rest is pressed into one of
+# them. The share of the rest that is removed in a step, and the top speed of that [m/s]. Choices.
+_SLOP, _AT_REST, _SHARE, _TOP = 5e-4, 2e-3, 1.0, 1.0
 # Rounds in which contacts are looked for, and by how much those of one round must turn a hinge for
 # a further one [rad]. Choices: 0.2 degrees move the end of a limb by .3 mm.
 _ROUNDS, _TURN = 3, 0.003
@@ -543,7 +544,7 @@ def _measure(given: tuple[tuple[jax.Array, jax.Array], ...], at_rest: jax.Array,
         )
         contact = box_contact(pair, later)
         closing = jnp.maximum(contact.start - contact.gap, 0)
-        tolerated = jnp.maximum(at_rest, _SLOP)
+        tolerated = jnp.clip(at_rest, _SLOP, _AT_REST)
         parted = jnp.clip(-_SHARE * (contact.start + tolerated), 0, dt * _TOP)
         target = jnp.minimum(contact.start, 0) + jnp.minimum(parted, closing)
         need = (target - contact.gap) / dt**2
