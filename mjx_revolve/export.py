@@ -13,7 +13,6 @@ import keyword
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mjx_revolve.inputs.commands import (
     Parser,
@@ -31,10 +30,6 @@ from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import PAGES, check_name, short_path, write_atomic
 from mjx_revolve.inputs.packages import check_package
 from mjx_revolve.numerics import runtime
-
-if TYPE_CHECKING:
-    from mjx_revolve.episodes.champion import Episode
-    from mjx_revolve.formats.brain import Brain
 
 # By option: what its file is called in a folder, what it may end in, and what it is.
 _FORMATS = {
@@ -127,7 +122,9 @@ def main(argv: list[str] | None = None) -> int:
     runtime.fix_threads()
     from mjx_revolve.episodes.early_checks import check_episode_files
 
-    check_episode_files(arguments)
+    no_genes = InputError("--controller", "a champion", "a morphology, which has no genes")
+    if check_episode_files(arguments) and arguments.controller is not None:
+        raise no_genes
     runtime.prepare_process()
     # JAX takes seconds to import: not for `--help`.
     from mjx_revolve.episodes.champion import load_asked
@@ -146,7 +143,13 @@ def main(argv: list[str] | None = None) -> int:
         files = _all_files(folder)
     brain, lacking = None, []
     try:
-        brain = _brain_of(episode) if "controller" in files else None
+        brain = None
+        if "controller" in files:
+            if episode.fitness is None or episode.genes is None:
+                raise no_genes
+            from mjx_revolve.formats.brain import champion_brain
+
+            brain = champion_brain(episode.fitness, episode.genes)
     except InputError as error:
         if arguments.controller is not None:
             raise
@@ -169,15 +172,6 @@ def main(argv: list[str] | None = None) -> int:
     for reason in lacking:  # the other formats do not need it
         print(reason, file=sys.stderr)
     return 0
-
-
-def _brain_of(episode: Episode) -> Brain:
-    """The brain of an episode."""
-    from mjx_revolve.formats.brain import champion_brain
-
-    if episode.fitness is None or episode.genes is None:
-        raise InputError("--controller", "a champion", "a morphology, which has no genes")
-    return champion_brain(episode.fitness, episode.genes)
 
 
 if __name__ == "__main__":

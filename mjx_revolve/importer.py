@@ -17,7 +17,8 @@ from mjx_revolve.inputs.commands import (
     read_path,
     run_command,
 )
-from mjx_revolve.inputs.files import read_file, short_path
+from mjx_revolve.inputs.files import short_path
+from mjx_revolve.inputs.xml_reader import load_robot_xml
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -45,7 +46,7 @@ def main(argv: list[str] | None = None) -> int:
         help="folder; files of these names in it are replaced (default: here, where none is)",
     )  # fmt: skip
     arguments = parser.parse_args(argv)
-    read_file(arguments.file, 1)  # it is there
+    load_robot_xml(arguments.file)
     check_output_folder(arguments.out or ".", "--out" if arguments.out else "")
     # MuJoCo takes a second to import: not for `--help`.
     from mjx_revolve.formats.import_robot import import_robot

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from mjx_revolve.inputs.commands import Parser, program, read_path, read_world, run_command, whole
 from mjx_revolve.inputs.errors import plain
 from mjx_revolve.inputs.trust import add_trust_argument, opening
-from mjx_revolve.numerics.runtime import prepare_process
+from mjx_revolve.numerics.runtime import fix_threads, prepare_process
 
 if TYPE_CHECKING:
     from mjx_revolve.view.live.simulation import LiveSimulation
@@ -55,6 +55,12 @@ def main(argv: list[str] | None = None) -> int:
         help="for how many there is room; more are slower (default: %(default)s)")  # fmt: skip
     add_trust_argument(parser)
     arguments = parser.parse_args(argv)
+    named = [*arguments.paths, *([arguments.world] if arguments.world else [])]
+    fix_threads()
+    from mjx_revolve.episodes.early_checks import check_live_files
+
+    with opening(*named, trust=arguments.trust):
+        check_live_files(arguments.paths, arguments.world)
     prepare_process()
     from mjx_revolve.episodes.tank import make_tank
     from mjx_revolve.view.live.page import live_page
@@ -62,7 +68,6 @@ def main(argv: list[str] | None = None) -> int:
     from mjx_revolve.view.live.server import LiveServer
     from mjx_revolve.view.live.simulation import LiveSimulation
 
-    named = [*arguments.paths, *([arguments.world] if arguments.world else [])]
     with opening(*named, trust=arguments.trust):
         catalogue = load_catalogue(arguments.paths, arguments.world)
         room = arguments.robots

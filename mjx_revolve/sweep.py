@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,11 +26,11 @@ from mjx_revolve.inputs.commands import (
     run_command,
     whole,
 )
-from mjx_revolve.inputs.errors import plain
+from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import short_path
-from mjx_revolve.inputs.grids import MOST_SEEDS, read_axes
+from mjx_revolve.inputs.grids import MOST_SEEDS, combine, read_axes
 from mjx_revolve.inputs.shipped import find_shipped
-from mjx_revolve.inputs.trust import add_trust_argument
+from mjx_revolve.inputs.trust import add_trust_argument, opening_config
 from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
@@ -81,7 +81,8 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     arguments = _parser().parse_args(argv)
     check_run_arguments(arguments)
     path = find_shipped(arguments.config, "configs").absolute()
-    read_axes(arguments.settings)  # what is no setting at all is known at once
+    runtime.fix_threads()
+    _check_configs(path, arguments.settings, arguments.trust)
     print(plain(f"loading {arguments.config}"), flush=True)  # it takes seconds
     runtime.prepare_process()
     from mjx_revolve.evolution.executor import make_executor
@@ -117,6 +118,19 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
         print(f"warning: {line}", file=sys.stderr)
     print(f"report: {short_path(report.page)}; {short_path(report.table)}")
     return code
+
+
+def _check_configs(path: Path, settings: Sequence[str], trust: bool) -> None:
+    """Refuses wrong configurations before JAX is imported."""
+    from mjx_revolve.episodes.config import load_config
+
+    cases = combine(read_axes(settings), path.stem)
+    for case, own in cases.items():
+        try:
+            with opening_config(path, trust):
+                load_config(path, own)
+        except InputError as error:
+            raise InputError(f"{case}: {error}" if len(cases) > 1 else str(error)) from None
 
 
 def _usual_folder(sweep: Sweep) -> Path:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from mjx_revolve.body.catalogue import MODULES, load_modules
 from mjx_revolve.body.morphology import Morphology, load_morphology
-from mjx_revolve.episodes.run_reader import ChampionRecord, RunReader, read_champion
+from mjx_revolve.episodes.config import Config, load_config
+from mjx_revolve.episodes.named_files import read_modules
+from mjx_revolve.episodes.run_reader import ChampionRecord, RunReader, find_run, read_champion
 from mjx_revolve.inputs.commands import opening_episode
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import check_path
-from mjx_revolve.inputs.shipped import find_shipped
+from mjx_revolve.inputs.shipped import find_shipped, list_shipped
 from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.water.world import World, load_world
 
@@ -48,11 +52,14 @@ def read_episode_file(
     return None
 
 
-def check_episode_files(arguments: argparse.Namespace) -> None:
+def check_episode_files(arguments: argparse.Namespace) -> bool:
     """Checks the files that `champion.load_episode` will read first.
 
     Args:
         arguments: with what `commands.add_episode_arguments` adds.
+
+    Returns:
+        Whether it is a morphology, which has no genes.
 
     Raises:
         InputError: a file is wrong, or not trusted.
@@ -61,10 +68,56 @@ def check_episode_files(arguments: argparse.Namespace) -> None:
         path, world, modules = arguments.path, arguments.world, arguments.modules
         if (arguments.individual is not None or arguments.colony) and check_path(path).is_dir():
             refuse_world(world, modules)
-            return
+            return False
         found = read_episode_file(path, world, modules)
         if isinstance(found, ChampionRecord):
             found.load_config()
+        return isinstance(found, tuple)
+
+
+def check_live_files(paths: Sequence[str], world: str | None) -> None:
+    """Checks the files that a live world will read first; arguments as of `load_catalogue`.
+
+    Raises:
+        InputError: a file is missing or wrong.
+    """
+    kinds = {path: named_kind(path) for path in paths}
+    configs = [read_named_config(path) for path, kind in kinds.items() if kind != "body"]
+    config = configs[0] if configs else load_config("lake_swim")
+    if world is not None:
+        load_world(os.path.expanduser(world))
+    for path, kind in kinds.items():
+        if kind == "body":
+            body = find_shipped(path, "morphologies")
+            load_morphology(body, read_modules(config), config.allow_overlap)
+
+
+def named_kind(path: str) -> str:
+    """The kind of a path: "run", "config" or "body"; InputError for anything else."""
+    place = Path(path)
+    if place.is_dir():
+        find_run(place)
+        return "run"
+    configs, bodies = list_shipped("configs"), list_shipped("morphologies")
+    if not place.exists() and path in configs:
+        return "config"
+    if not place.exists() and path in bodies:
+        return "body"
+    wanted = "a run folder, a configuration or a morphology"
+    if not place.is_file():
+        names = ", ".join((*configs, *bodies))
+        raise InputError(path, wanted, f"none, and no shipped one of this name ({names})")
+    data = load_yaml(place)
+    if isinstance(data, dict) and "body" in data:
+        return "body"
+    if isinstance(data, dict) and "task" in data:
+        return "config"
+    raise InputError(path, wanted, "a file with neither task nor body")
+
+
+def read_named_config(path: str) -> Config:
+    """The configuration of a run folder, or of a file or a shipped one's name."""
+    return RunReader(find_run(path)).load_config() if Path(path).is_dir() else load_config(path)
 
 
 def refuse_world(world: str | None, modules: str | Path | None) -> None:

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import mujoco
@@ -22,7 +21,7 @@ import trimesh
 
 from mjx_revolve.formats.inertias import spread
 from mjx_revolve.inputs.errors import InputError, reading
-from mjx_revolve.inputs.files import read_file
+from mjx_revolve.inputs.xml_reader import load_robot_xml
 from mjx_revolve.numerics.spatial import quat_to_matrix
 
 Place = tuple[np.ndarray, np.ndarray]  # position [3] [m] and rotation [3, 3]
@@ -117,14 +116,8 @@ def read_rigid_robot(path: str | Path) -> RigidRobot:
     Raises:
         InputError: the file cannot be read, or holds no such robot; the message says where.
     """
-    text = read_file(path)
+    root = load_robot_xml(path)
     with reading(path):
-        try:
-            root = ElementTree.fromstring(text)
-        except (ElementTree.ParseError, LookupError, ValueError) as error:  # and encodings
-            raise InputError(f"expected XML; found: {error}") from None
-        if root.tag not in ("robot", "mujoco"):
-            raise InputError(f"expected URDF (robot) or MJCF (mujoco); found <{root.tag}>")
         read = _read_urdf if root.tag == "robot" else _read_mjcf
         robot = read(root, Path(path))
         if robot.links[0].inertia[3, 3] <= 0:

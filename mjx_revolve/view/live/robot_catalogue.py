@@ -15,7 +15,8 @@ import numpy as np
 from mjx_revolve.body.morphology import Morphology, load_morphology, trim_neutral
 from mjx_revolve.engine.robot import Robot, build_robot, check_timestep
 from mjx_revolve.engine.spheres import count_spheres
-from mjx_revolve.episodes.config import Config, load_config, override_config
+from mjx_revolve.episodes.config import Config, override_config
+from mjx_revolve.episodes.early_checks import named_kind, read_named_config
 from mjx_revolve.episodes.fitness import MixedFitness, make_mixed_fitness
 from mjx_revolve.episodes.individual_log import INDIVIDUALS, read_individuals
 from mjx_revolve.episodes.named_files import read_modules, read_world
@@ -23,7 +24,6 @@ from mjx_revolve.episodes.run_reader import RunReader, find_run
 from mjx_revolve.episodes.tasks import COLONY_FITNESS, score_unit
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.shipped import find_shipped, list_shipped
-from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.view.live.simulation import CatalogueEntry
 from mjx_revolve.view.population import rank
 from mjx_revolve.water.world import World, load_world
@@ -96,9 +96,9 @@ def load_catalogue(paths: Sequence[str], world: str | None = None) -> RobotCatal
     Raises:
         InputError: a file is missing or wrong, or a run has another controller.
     """
-    named = [(path, _kind(path)) for path in paths]
+    named = [(path, named_kind(path)) for path in paths]
     sources = [path for path, kind in named if kind != "body"]
-    config = _read_config(sources[0] if sources else _USUAL)
+    config = read_named_config(sources[0] if sources else _USUAL)
     changes: dict[str, Any] = {
         "engine": "population", "task.duration": _WHILE, "task.horizon": None
     }  # fmt: skip
@@ -111,7 +111,7 @@ def load_catalogue(paths: Sequence[str], world: str | None = None) -> RobotCatal
         if kind == "body":
             drafts += _bodies(config, water, find_shipped(path, "morphologies"))
             continue
-        own = _read_config(path)
+        own = read_named_config(path)
         if own.controller != config.controller:
             alike = f"that of {sources[0]}, as all robots of a world have one kind"
             raise InputError(f"{path}: controller", alike, f"another ({own.controller.type})")
@@ -160,33 +160,6 @@ def _entry(mixed: MixedFitness, draft: _Draft, robot: Robot) -> CatalogueEntry:
         return (mixed.config.evolution.std_init * draw).astype(np.float32)
 
     return CatalogueEntry(draft.name, draft.short, draft.group, robot, genes)
-
-
-def _kind(path: str) -> str:
-    """The kind of a path: "run", "config" or "body"; InputError for anything else."""
-    place = Path(path)
-    if place.is_dir():
-        find_run(place)
-        return "run"
-    configs, bodies = list_shipped("configs"), list_shipped("morphologies")
-    if not place.exists() and path in configs:
-        return "config"
-    if not place.exists() and path in bodies:
-        return "body"
-    wanted = "a run folder, a configuration or a morphology"
-    if not place.is_file():
-        names = ", ".join((*configs, *bodies))
-        raise InputError(path, wanted, f"none, and no shipped one of this name ({names})")
-    data = load_yaml(place)
-    if isinstance(data, dict) and "body" in data:
-        return "body"
-    if isinstance(data, dict) and "task" in data:
-        return "config"
-    raise InputError(path, wanted, "a file with neither task nor body")
-
-
-def _read_config(path: str) -> Config:
-    return RunReader(find_run(path)).load_config() if Path(path).is_dir() else load_config(path)
 
 
 # --- morphologies ---------------------------------------------------------------------------------
