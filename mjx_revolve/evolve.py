@@ -112,6 +112,31 @@ def _lead(
     interrupts: Interrupts,
 ) -> int:
     """A whole run; `executors` ends its workers."""
+    with runtime.few_collections():
+        run = _start(arguments, make_fitness, executors, interrupts)
+    try:
+        return _evolve(run, interrupts)
+    except WorkerError as error:
+        raise WorkerError(f"{error}\n{_resume_hint(run)}") from None
+    except BrokenPipeError:
+        raise  # standard output is closed: no fault of the disk
+    except OSError as error:
+        print(f"error: {describe_refusal(error)}", file=sys.stderr)
+        if saved := run.folder.checkpoints():
+            last = f"the last checkpoint, {short_path(saved[0])}, is intact"
+            print(f"{last}\n{_resume_hint(run)}", file=sys.stderr)
+        return 1
+    finally:
+        run.close()
+
+
+def _start(
+    arguments: argparse.Namespace,
+    make_fitness: Callable | None,
+    executors: contextlib.ExitStack,
+    interrupts: Interrupts,
+) -> Run:
+    """The run, new or resumed, with its workers."""
     started: list[LocalWorker] = []
 
     def make(config: Config) -> Executor:
@@ -149,24 +174,9 @@ def _lead(
         executors.callback(worker.end)
     if folder is None:
         with opening_config(path, trust):
-            run = Run.begin(path, settings, arguments.out, make, interrupts.writing)
-    else:
-        with opening(folder, *([path] if path else []), trust=trust):
-            run = Run.resume(folder, path, settings, make)
-    try:
-        return _evolve(run, interrupts)
-    except WorkerError as error:
-        raise WorkerError(f"{error}\n{_resume_hint(run)}") from None
-    except BrokenPipeError:
-        raise  # standard output is closed: no fault of the disk
-    except OSError as error:
-        print(f"error: {describe_refusal(error)}", file=sys.stderr)
-        if saved := run.folder.checkpoints():
-            last = f"the last checkpoint, {short_path(saved[0])}, is intact"
-            print(f"{last}\n{_resume_hint(run)}", file=sys.stderr)
-        return 1
-    finally:
-        run.close()
+            return Run.begin(path, settings, arguments.out, make, interrupts.writing)
+    with opening(folder, *([path] if path else []), trust=trust):
+        return Run.resume(folder, path, settings, make)
 
 
 def _check(arguments: argparse.Namespace, files: bool) -> Config:

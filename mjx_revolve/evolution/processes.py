@@ -21,6 +21,7 @@ import tempfile
 import threading
 import time
 import traceback
+import warnings
 from collections import deque
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
@@ -48,6 +49,7 @@ _PROGRAM = (
     "import sys; sys.path[:] = sys.argv[2:]; "
     "from mjx_revolve.evolution.processes import serve; serve(int(sys.argv[1]))"
 )
+_DESCRIPTORS = "/proc/self/fd"
 # Time between two checks of the workers' time limits [s].
 _TICK = 0.25
 # How much of the end of a worker's log is read [bytes].
@@ -74,8 +76,15 @@ def serve(descriptor: int) -> NoReturn:
     except (EOFError, OSError):  # its end, as that of standard input, is that of the run's process
         _remove_scratch()
     # JAX's clean-up at exit takes a tenth of a second, and a worker has nothing to clean up.
-    sys.stderr.flush()
+    _flush()
     os._exit(0)
+
+
+def _flush() -> None:
+    """What waits for output; a stream is None where it is closed, and its disk may be full."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError, OSError, ValueError):
+            stream.flush()
 
 
 def _end_with_parent() -> NoReturn:
@@ -95,13 +104,14 @@ def _work(channel: Connection) -> None:
     global _scratch
     core, cache = channel.recv()
     try:
-        runtime.prepare_worker(core, cache)
-        from mjx_revolve.evolution.blocks import evaluate_block, key_from_data
-        from mjx_revolve.evolution.fingerprints import identify
+        with runtime.few_collections():
+            runtime.prepare_worker(core, cache)
+            from mjx_revolve.evolution.blocks import evaluate_block, key_from_data
+            from mjx_revolve.evolution.fingerprints import identify
 
-        job, _scratch = channel.recv()
-        fitness = open_job(job, _scratch)
-        compile_job(job, fitness)
+            job, _scratch = channel.recv()
+            fitness = open_job(job, _scratch)
+            compile_job(job, fitness)
         if core is not None:
             runtime.pin_process([core])
         channel.send(identify(fitness))
@@ -124,9 +134,11 @@ def _work(channel: Connection) -> None:
 def can_fork() -> bool:
     """Whether this process may fork workers once it has imported what they need.
 
-    Where it had imported JAX before, that may have threads; other systems' libraries forbid forks.
+    Where it had imported JAX before, that may have threads, as others may than the main one and
+    that of `Interrupts`, which holds no lock; other systems' libraries forbid forks.
     """
-    return sys.platform == "linux" and "jax" not in sys.modules
+    alone = "jax" not in sys.modules and threading.active_count() <= 2
+    return alone and sys.platform == "linux" and Path(_DESCRIPTORS).is_dir()
 
 
 class _Fork:
@@ -137,10 +149,11 @@ class _Fork:
         theirs, ours = os.pipe()
         self.stdin = open(ours, "wb", buffering=0)  # noqa: SIM115  (kept open)
         self.returncode: int | None = None
-        sys.stdout.flush()
-        sys.stderr.flush()
+        _flush()
         try:
-            self.pid = os.fork()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DeprecationWarning)  # of threads, see `can_fork`
+                self.pid = os.fork()
             if not self.pid:
                 self._serve(descriptor, theirs, log)
         finally:
@@ -155,25 +168,30 @@ class _Fork:
             for source, place in ((stdin, 0), (log, 1), (log, 2)):
                 os.dup2(source, place)
             # Pipes to other workers would outlive this process's parent.
-            os.closerange(3, descriptor)
-            os.closerange(descriptor + 1, os.sysconf("SC_OPEN_MAX"))
+            for number in {int(name) for name in os.listdir(_DESCRIPTORS)} - {0, 1, 2, descriptor}:
+                with contextlib.suppress(OSError):  # that of the folder
+                    os.close(number)
             serve(descriptor)
         except BaseException:
             traceback.print_exc()
-            sys.stderr.flush()
+            _flush()
         finally:
             os._exit(1)
 
     def kill(self) -> None:
         """Kills it, unless it has been waited for."""
         if self.returncode is None:
-            os.kill(self.pid, signal.SIGKILL)
+            with contextlib.suppress(ProcessLookupError):  # where SIGCHLD is ignored
+                os.kill(self.pid, signal.SIGKILL)
 
     def wait(self, timeout: float | None = None) -> int:
         """Its exit code, negative for a signal; `subprocess.TimeoutExpired` after so long [s]."""
         began = time.monotonic()
         while self.returncode is None:
-            pid, status = os.waitpid(self.pid, 0 if timeout is None else os.WNOHANG)
+            try:
+                pid, status = os.waitpid(self.pid, 0 if timeout is None else os.WNOHANG)
+            except ChildProcessError:  # SIGCHLD is ignored, or another has waited; as of Popen
+                pid, status = self.pid, 0
             if pid:
                 self.returncode = os.waitstatus_to_exitcode(status)
             elif timeout is not None and time.monotonic() - began > timeout:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gc
 import hashlib
 import importlib.metadata
 import importlib.util
@@ -32,6 +33,8 @@ _THREAD_SETTINGS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _PACKAGES = (
     "mjx_revolve", "jax", "jaxlib", "mujoco", "mujoco-mjx", "evosax", "numpy", "scipy",
 )  # fmt: skip
+# When Python looks for garbage: thresholds of `gc`, usually, and while a process starts (a choice).
+_COLLECTIONS, _SELDOM = gc.get_threshold(), 50_000
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 # A worker caches only programs that took longer to compile than this [s]. The main process caches
 # all: at a start it runs a hundred small programs, 2 s to compile and .3 s to read back.
@@ -51,6 +54,16 @@ def fix_threads() -> None:
     """Fixes the thread settings that NumPy reads when it is imported."""
     for name in _THREAD_SETTINGS:
         os.environ.setdefault(name, "1")
+
+
+@contextlib.contextmanager
+def few_collections() -> Iterator[None]:
+    """Looks for garbage seldom: what imports and traces make stays, and looking takes a sixth."""
+    gc.set_threshold(_SELDOM, *_COLLECTIONS[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*_COLLECTIONS)
 
 
 def prepare_process() -> Path | None:
