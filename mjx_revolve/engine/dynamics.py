@@ -316,6 +316,7 @@ def _with_contact(
     found, clearance, pressed = contact_acceleration(
         tree.meetings(like),
         state.clearance - total(*ways),
+        state.clearance < 0,
         lambda which: _look_at(tree, factors, (state.speed, qacc[2], levers), dt, which),
         6 + len(ways),
         dt,
