@@ -299,6 +299,9 @@ def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None 
         The exit code: `main`'s; 2 if the input is wrong (`InputError`), 1 if the system refused
         something (a full disk, too little memory), 130 when interrupted.
     """
+    # Closed ones are None; what is opened next would get their numbers.
+    sys.stdout = sys.stdout or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # a test's or a notebook's has none
             # Without UTF-8, Python would end at the first `±` of a result that took hours.
