@@ -59,9 +59,9 @@ _WORD = 32
 _FAR = 1e3
 # What no contact needs, and what stands for the need of those that push already [m/s²].
 _NONE, _KEPT = -1e9, 1e9
-# Overlap that is tolerated [m]: that at rest, at least and at most so much. Choices: with half a
-# millimetre less at most, what stands between two that it overlaps at rest is pressed into one of
-# them. The share of the rest that is removed in a step, and the top speed of that [m/s]. Choices.
+# Overlap that is tolerated [m]: that at rest, at least and at most so much; with 1.5 mm, what is
+# wedged between two others was pressed into one of them. The share of the rest that is removed in a
+# step, and the top speed of that [m/s]. Choices.
 _SLOP, _AT_REST, _SHARE, _TOP = 5e-4, 2e-3, 1.0, 1.0
 # Rounds in which contacts are looked for, and by how much those of one round must turn a hinge for
 # a further one [rad]. Choices: 0.2 degrees move the end of a limb by .3 mm.

@@ -19,6 +19,9 @@ from mjx_revolve.inputs.shipped import find_shipped, list_shipped
 from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.water.world import World, load_world
 
+USUAL_CONFIG = "lake_swim"
+"""The configuration with the default water and controller."""
+
 
 def read_episode_file(
     path: str | Path, world: str | None, modules: str | Path | None
@@ -83,7 +86,7 @@ def check_live_files(paths: Sequence[str], world: str | None) -> None:
     """
     kinds = {path: named_kind(path) for path in paths}
     configs = [read_named_config(path) for path, kind in kinds.items() if kind != "body"]
-    config = configs[0] if configs else load_config("lake_swim")
+    config = configs[0] if configs else load_config(USUAL_CONFIG)
     if world is not None:
         load_world(os.path.expanduser(world))
     for path, kind in kinds.items():

@@ -16,7 +16,7 @@ from mjx_revolve.body.morphology import Morphology, load_morphology, trim_neutra
 from mjx_revolve.engine.robot import Robot, build_robot, check_timestep
 from mjx_revolve.engine.spheres import count_spheres
 from mjx_revolve.episodes.config import Config, override_config
-from mjx_revolve.episodes.early_checks import named_kind, read_named_config
+from mjx_revolve.episodes.early_checks import USUAL_CONFIG, named_kind, read_named_config
 from mjx_revolve.episodes.fitness import MixedFitness, make_mixed_fitness
 from mjx_revolve.episodes.individual_log import INDIVIDUALS, read_individuals
 from mjx_revolve.episodes.named_files import read_modules, read_world
@@ -28,8 +28,6 @@ from mjx_revolve.view.live.simulation import CatalogueEntry
 from mjx_revolve.view.population import rank
 from mjx_revolve.water.world import World, load_world
 
-# The configuration with the default water and controller.
-_USUAL = "lake_swim"
 _FIRST = "spider"  # of the shipped robots
 # Robots live on, and may come to a bed that they could not reach in an episode [s]. A choice.
 _WHILE = 600.0
@@ -98,7 +96,7 @@ def load_catalogue(paths: Sequence[str], world: str | None = None) -> RobotCatal
     """
     named = [(path, named_kind(path)) for path in paths]
     sources = [path for path, kind in named if kind != "body"]
-    config = read_named_config(sources[0] if sources else _USUAL)
+    config = read_named_config(sources[0] if sources else USUAL_CONFIG)
     changes: dict[str, Any] = {
         "engine": "population", "task.duration": _WHILE, "task.horizon": None
     }  # fmt: skip
