@@ -351,6 +351,7 @@ def _find_contacts(
     cells = (
         jnp.asarray(meetings.halves.T, dtype) if halves and meetings.halves is not None else None
     )
+    spheres = _spheres(meetings, which, poses[1], dtype)
     pairs = [jnp.asarray(x, jnp.int32).reshape(-1) for x in (meetings.first, meetings.second)]
     at_rest = jnp.asarray(meetings.rest, dtype).reshape(-1)
 
@@ -367,18 +368,13 @@ def _find_contacts(
             found.append(_Given(shell, take_lanes(body, shell), place, lane))
         return tuple(found)
 
-    def sphere(box: _Given) -> tuple[jax.Array, jax.Array]:
-        frame = pick(frames[12:], box.body * size + box.lane)
-        place, radius = pick(shapes[:3], box.number), pick(shapes[-1:], box.number)
-        return frame[9:] + matvec(frame[:9].reshape(3, 3, -1), place), radius[0]
-
     def gather(carry: Any) -> Any:
         """The next spheres."""
         block, listed, clear = carry
         number = block * width + jnp.arange(width, dtype=jnp.int32)
         one, other = look_up(jnp.minimum(number, npair * size - 1))
-        (start, radius), (end, far) = sphere(one), sphere(other)
-        away, reach = end - start, radius + far
+        start, end = (pick(spheres, box.shell * size + box.lane) for box in (one, other))
+        away, reach = end[:3] - start[:3], start[3] + end[3]
         given = take_lanes(real, one.lane) & (one.shell != other.shell) & (number < npair * size)
         square = dot(away, away)
         near = given & (square < (reach + take_lanes(drift, one.lane)) ** 2)
@@ -493,6 +489,17 @@ def _find_at_once(
     rest = jnp.moveaxis(jnp.take_along_axis(rest, chosen[None], 1), 0, 1) * free[:, None]
     need = jnp.where(free > 0, jnp.take_along_axis(need, chosen, 0), _NONE)[:_MOST]
     return ContactTable(jnp.where(kept > 0, _KEPT, need), rest, gap.min(0))
+
+
+def _spheres(meetings: Meetings, which: jax.Array, ahead: BodyFrames, dtype: Any) -> jax.Array:
+    """`[4, nshell few]` middles of some robots' bounding spheres, root's frame, and radii [m]."""
+    body, lanes = meetings.body, meetings.lanes
+    shapes = meetings.shapes.reshape(-1, len(body), lanes)
+    own = shapes if lanes == 1 else take_lanes(shapes, which)
+    frames = jnp.stack([jnp.asarray(x, dtype)[body] for x in jax.tree.leaves(ahead)])
+    middle = frames[9:] + matvec(frames[:9].reshape(3, 3, len(body), -1), own[:3])
+    radius = jnp.broadcast_to(own[-1:], middle[:1].shape)
+    return materialize(jnp.concatenate([middle, radius]).reshape(4, -1))
 
 
 class ContactTable(NamedTuple):
