@@ -7,6 +7,7 @@ Reads URDF or MuJoCo's MJCF; writes a morphology and its types of modules as YAM
 
 from __future__ import annotations
 
+import shlex
 import sys
 
 from mjx_revolve.inputs.commands import (
@@ -60,7 +61,8 @@ def main(argv: list[str] | None = None) -> int:
           f"{1e6 * robot.morphology.volume:.4g} cm³")  # fmt: skip
     for line in robot.missing:
         print(f"  not taken over: {line}")
-    print(f"evolve it with: --set morphology={body} --set modules={modules}")
+    options = shlex.join(["--set", f"morphology={body}", "--set", f"modules={modules}"])
+    print(f"evolve it with: {options}")
     return 0
 
 

@@ -32,6 +32,8 @@ _DRY = {"volume": 0.0, "contact": False, "drag": "off", "added_mass": False}
 _CORNERS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], float)
 # Ranges of a continuous joint and of one that cannot turn [rad], as our hinges have a range.
 _WHOLE, _STILL = np.pi, 1e-3
+# A range as wide as this is none [rad]. A choice: without limits SDF has ±1e16.
+_ENDLESS = 1e3
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,8 @@ def _make(robot: RigidRobot) -> ImportedRobot:
     frames: list[np.ndarray] = []
     items: list[dict[str, Any]] = []
     missing = robot.missing
-    names = _names([link.name for link in robot.links])
+    given = [link.name for link in robot.links]
+    names = _names(given)
     taken = {*names, *MODULES}
     for link, name in zip(robot.links, names, strict=True):
         shapes = link.solid or link.seen
@@ -106,7 +109,9 @@ def _make(robot: RigidRobot) -> ImportedRobot:
         frames.append(turn)
         kinds[name], welded = _module(link, shapes, turn, missing)
         rgb = next((s.rgb for s in (*link.seen, *link.solid) if s.rgb), None)
-        item: dict[str, Any] = {"id": name, "type": name} | _color(rgb)
+        # A type's name is plain, as messages of ROS need it; an id keeps the file's.
+        known = link.name.isprintable() and [*given, *names].count(link.name) == 1
+        item: dict[str, Any] = {"id": link.name if known else name, "type": name} | _color(rgb)
         items.append(item)
         for number, (part, slot) in enumerate(welded, 1):
             own = free_name(name, taken, number)
@@ -225,7 +230,8 @@ def _module(
 
 def _hinge(link: RigidLink, turn: np.ndarray, missing: list[str]) -> dict[str, Any]:
     low, high = link.limits.get("range", (-_WHOLE, _WHOLE))
-    if "range" not in link.limits:
+    if "range" not in link.limits or high - low > _ENDLESS:
+        low, high = -_WHOLE, _WHOLE
         missing.append(f"{link.name}: turns all the way; here from -π to π")
     if low > high:
         raise InputError(link.name, "a range [lowest, highest]", f"[{low:g}, {high:g}]")

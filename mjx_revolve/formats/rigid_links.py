@@ -65,6 +65,7 @@ class RigidLink:
         inertia: `[4, 4]` pseudo-inertia (see `inertias`), link frame.
         solid: shapes that collide.
         seen: visible shapes.
+        both: of MJCF, those in `solid` that MuJoCo's viewer shows as well.
     """
 
     name: str
@@ -77,6 +78,7 @@ class RigidLink:
     inertia: np.ndarray = field(default_factory=lambda: np.zeros((4, 4)))
     solid: list[Shape] = field(default_factory=list)
     seen: list[Shape] = field(default_factory=list)
+    both: list[Shape] = field(default_factory=list)
 
 
 @dataclass
@@ -163,7 +165,7 @@ def _mesh(
     position, rotation = place
     low, high = triangles.min((0, 1)), triangles.max((0, 1))
     size, middle = np.maximum(high - low, 1e-4), (low + high) / 2
-    found = closed_volume(triangles)
+    found = closed_volume(triangles) or closed_volume(triangles[:, ::-1])  # or inside out
     if found is None:
         missing.append(f"{name}: a mesh with holes; the box around it stands for its volume")
     volume, center = found or (float(np.prod(size)), middle)
@@ -226,8 +228,16 @@ def _read_urdf(root: Element, path: Path) -> RigidRobot:
     if len(tops) != 1:
         raise InputError(f"expected one root link; found {', '.join(tops) or 'none'}")
     colors = {one.get("name", ""): one.find("color") for one in root.findall("material")}
-    place, reached = (np.zeros(3), np.eye(3)), set()
-    stack: list[tuple[str, int, Any, str, Any]] = [(tops[0], -1, place, tops[0], None)]
+    top, place, reached = tops[0], (np.zeros(3), np.eye(3)), set()
+    # A world that holds the robot alone is no part of it, nor is where the robot stands in it.
+    while not len(links[top]) and len(below.get(top, [])) == 1:
+        kind, child = below[top][0].get("type"), below[top][0].find("child")
+        assert child is not None
+        if kind != "floating" and (kind, top) != ("fixed", "world"):
+            break
+        reached.add(top)
+        top = child.get("link", "")
+    stack: list[tuple[str, int, Any, str, Any]] = [(top, -1, place, top, None)]
     while stack:
         name, parent, place, own, hinge = stack.pop()
         reached.add(name)
@@ -391,7 +401,8 @@ def _read_mjcf(root: Element, path: Path) -> RigidRobot:
     tops = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
     if not tops:
         raise InputError("expected a body; found none")
-    top = max(tops, key=lambda body: model.body_subtreemass[body])
+    moving = {int(model.body_rootid[body]) for body in np.flatnonzero(model.body_dofnum)}
+    top = max(tops, key=lambda body: (body in moving, model.body_subtreemass[body]))
     robot = RigidRobot(root.get("model") or path.stem)
     missing = robot.missing
     missing += [f"the body {model.body(body).name}, another robot" for body in tops if body != top]
@@ -420,6 +431,12 @@ def _read_mjcf(root: Element, path: Path) -> RigidRobot:
         link.inertia += _spread(float(model.body_mass[body]), center, axes, moments)
         for geom in np.flatnonzero(model.geom_bodyid == body):
             _mjcf_shape(model, int(geom), place, link, missing)
+    for link in robot.links:
+        # Shapes that do not collide stand for those that do, or are an eye on a hull. A choice:
+        # those of less than half of its volume.
+        seen, both = (sum(s.volume for s in shapes) for shapes in (link.seen, link.both))
+        if link.seen and seen < both / 2:
+            link.seen[:0] = link.both
     turns = np.isin(model.actuator_trntype, list(_MOVES_JOINTS))
     for count, words in (
         ((model.geom_bodyid == 0).sum(), "geoms of the world"), (model.neq, "equality constraints"),
@@ -490,8 +507,12 @@ def _mjcf_shape(
         start, points = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
         corners = model.mesh_vert[start : start + points].astype(np.float64)
         triangles = corners[model.mesh_face[first : first + count]]
-        shapes.append(_mesh(triangles, there, rgb, link.name, missing))
+        shape = _mesh(triangles, there, rgb, link.name, missing)
     elif kind in _KINDS:
-        shapes.append(_box(_KINDS[kind], model.geom_size[geom], there, rgb))
+        shape = _box(_KINDS[kind], model.geom_size[geom], there, rgb)
     else:
         missing.append(f"{link.name}: a geom that is no box, sphere, cylinder, capsule or mesh")
+        return
+    shapes.append(shape)
+    if collides and model.geom_group[geom] < _COLLIDES:
+        link.both.append(shape)

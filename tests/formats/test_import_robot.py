@@ -348,3 +348,16 @@ def test_meshes_that_are_missing_or_open_are_named(tmp_path):
     found = import_robot(tmp_path / "robot.urdf")
     assert found.missing[0].startswith("base: a mesh with holes; the box around it")
     assert found.modules["base_1"].volume == pytest.approx(0.06**3, rel=1e-2)
+
+
+def test_what_stands_around_a_robot_is_no_part_of_it(tmp_path):
+    """A static pool, a URDF's world link, an eye on a hull."""
+    pool = '<body name="pool" pos="0 0 9"><geom type="box" size="4 4 .1"/></body></worldbody>'
+    eye = '<body name="torso" pos="0 0 1"><geom size=".002" contype="0" conaffinity="0"/>'
+    text = MJCF.replace("</worldbody>", pool).replace('<body name="torso" pos="0 0 1">', eye)
+    found, usual = (import_robot(write(tmp_path, x, "robot.xml")) for x in (text, MJCF))
+    assert found.morphology.volume == pytest.approx(usual.morphology.volume, rel=1e-3)
+    world = '<link name="world"/><joint name="w" type="fixed"><parent link="world"/><child '
+    world += 'link="base"/><origin xyz="0 0 5"/></joint><link name="base">'
+    found = import_robot(write(tmp_path, URDF.replace('<link name="base">', world), "robot.urdf"))
+    assert found.morphology == import_robot(write(tmp_path, URDF, "robot.urdf")).morphology
