@@ -160,8 +160,7 @@ def test_the_quick_validation_passes_and_keeps_its_table(tmp_path, monkeypatch, 
     few = {name: validation_cases.CASES[name] for name in ("plate", "Munk", "floating")}
     monkeypatch.setattr(validation_cases, "CASES", few)
     assert validation.main(["--quick", "--out", str(tmp_path / "out")]) == 0
-    printed = capsys.readouterr().out
-    assert "all within their tolerances" in printed
+    assert "all within their tolerances" in capsys.readouterr().out
     lines = (tmp_path / "out" / "validation.csv").read_text(encoding="utf-8").splitlines()
     assert {line.split(",")[0] for line in lines} == {"case", "plate", "Munk"}
     assert (tmp_path / "out" / "validation.png").read_bytes().startswith(b"\x89PNG")

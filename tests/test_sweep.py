@@ -91,8 +91,7 @@ def test_a_sweep_is_a_grid_of_ordinary_runs_with_one_report(folder, no_pictures,
     # The report command makes the same page.
     (folder / "out" / "report.html").unlink()
     assert run_command(report.main, ["out"]) == 0
-    again = (folder / "out" / "report.html").read_text()
-    assert "6 of 6</b>runs finished" in again
+    assert "6 of 6</b>runs finished" in (folder / "out" / "report.html").read_text()
     assert run_command(report.main, ["out", "alone"]) == 2
     # Of a sweep that was made longer, runs that have not gone on are not finished.
     longer = ["--resume", f"out/{RUNS[0]}", "--set", "evolution.generations=6"]

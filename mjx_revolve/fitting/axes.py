@@ -27,6 +27,14 @@ _WAYS: dict[str, dict[str, tuple[str, float]]] = {
     "z points down and y to the right, of the water and of the robot: y, z, qy and qz=COLUMN*-1": {
         "y": ("y", -1), "z": ("z", -1), "qy": ("qy", -1), "qz": ("qz", -1)},
     "yaw turns clockwise: yaw=COLUMN*-1": {"yaw": ("yaw", -1)},
+    "y points to the right and yaw turns clockwise: y and yaw=COLUMN*-1": {
+        "y": ("y", -1), "yaw": ("yaw", -1)},
+    "y points to the right, of the water and of the robot: y, pitch and yaw=COLUMN*-1": {
+        "y": ("y", -1), "pitch": ("pitch", -1), "yaw": ("yaw", -1)},
+    "y points to the right, of the water and of the robot: y and pitch=COLUMN*-1": {
+        "y": ("y", -1), "pitch": ("pitch", -1)},
+    "z points down and y to the right, of the water and of the robot: y, z, pitch and yaw="
+    "COLUMN*-1": {"y": ("y", -1), "z": ("z", -1), "pitch": ("pitch", -1), "yaw": ("yaw", -1)},
 }  # fmt: skip
 
 

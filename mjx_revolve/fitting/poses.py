@@ -188,7 +188,7 @@ def check_marks(
             if np.median(fit_rigid(model[rows], seen[rows][:, order], planar)[2]) < bad / _BETTER:
                 raise InputError(
                     f"marks {names[a]} and {names[b]}: expected them as on the robot; found them "
-                    f"swapped from {time[rows][0]:g} s on"
+                    f"swapped from {time[rows][0]:.13g} s on"
                 )
     if usual > _MISFIT * length:
         raise InputError(

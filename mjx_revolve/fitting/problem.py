@@ -381,19 +381,31 @@ def make_problem(
     piece = steps * dt
     windows = max(1, math.ceil((end - begin).max() / piece - 1e-6))
     resets = np.zeros((windows, len(recordings)), bool)
-    short = resets.copy()
+    short, blind = resets.copy(), resets.copy()
     for r, view in enumerate(views):
         # Without attitude, nothing says how to begin again.
         whole = held[r] or view.quat is None or not np.isfinite(view.position).any()
         many = 1 if whole else max(1, int(usual[r] / piece / _PARTS + 0.25))
         resets[: many * _PARTS : _PARTS, r] = True
         short[: 1 if whole else max(1, int(usual[r] / piece + 0.25)), r] = True
+        at = begin[r] + piece * np.arange(windows)
+        unknown = np.full(windows, not np.isfinite(view.position).any())
         if view.quat is not None:  # nor in a gap of it
-            at = begin[r] + piece * np.arange(windows)
             known = [np.isfinite(x) for x in (view.quat[:, 0], *view.position.T[:2])]
             lost = np.any([gap(view.time[one], at) for one in known if one.any()], 0)
             lost[0] = False
             resets[lost, r] = short[lost, r] = False
+            unknown |= lost
+        # Nothing is known of what swims on after a gap in measured hinges, until it begins anew.
+        fine = begin[r] + dt * np.arange(windows * steps)
+        for name in (f"angle.{hinge}" for hinge in prescribed):
+            missing = gap(view.recording.signals[name].time, fine) & (fine <= end[r])
+            blind[:, r] |= missing.reshape(windows, steps).any(1)
+        unknown |= (view.quat is None) | (at >= until[r])
+        for k in range(1, windows):
+            if blind[k - 1, r] and not blind[k, r]:
+                blind[k, r] = unknown[k]
+                resets[k, r] = short[k, r] = not unknown[k]
     at = begin + piece * np.arange(windows)[:, None]
     starts = [view.starts(t) for view, t in zip(views, at.T, strict=True)]
     roots, spread = (np.stack([s[k] for s in starts], -1) for k in range(2))
@@ -413,13 +425,28 @@ def make_problem(
         np.stack([v.hinges_at(v.begin, prescribed, dt)[k] for v in views], -1) for k in range(2)
     )
     drive = Drive(resets, angles, speeds, ctrl, later, begin)
-    channels = [c for r, v in enumerate(views) for c in v.channels(r, until[r], servos_free)]
+    channels = [
+        _without(c, blind[:, r], begin[r], piece)
+        for r, v in enumerate(views)
+        for c in v.channels(r, until[r], servos_free)
+    ]
     variants = _variants(robot, tuple(own), tuple(h in prescribed for h in hinges))
     return FitProblem(
         robot, tuple(parameters), local, tuple(recordings), settings, begin, end, until, piece,
         every, drive, roots, spread, tuple(channels), variants,
         np.array([v.quat is None for v in views]), commands, short,
     )  # fmt: skip
+
+
+def _without(channel: Channel, blind: np.ndarray, begin: float, piece: float) -> Channel:
+    """A channel without what was measured in windows `[K]` that are blind."""
+    window = np.ceil((channel.time - begin) / piece - 1e-9).astype(int) - 1
+    none = blind[np.clip(window, 0, len(blind) - 1)]
+    if not none.any():
+        return channel
+    seen = np.where(none[:, None], np.nan, channel.seen) if len(channel.seen) else channel.seen
+    residual = lambda s: np.where(none[:, None], np.nan, channel.residual(s))  # noqa: E731
+    return channel._replace(seen=seen, residual=residual)
 
 
 @lru_cache(maxsize=8)

@@ -196,7 +196,11 @@ def _mapped(
     Sources that others of a study's recordings may have are left out, with a note; joints of
     another name than the module that has them go to that module alone.
     """
-    found, notes, body = dict(signals), [], robot.morphology
+    # What a map says of a source holds, not the source's own name; commands and angles keep theirs.
+    taken = {match["column"] for x in columns.values() if (match := _SOURCE.match(x))}
+    other = {n for n in taken if n in _POSE or n in _SENSED or n.startswith("mark.")}
+    found, notes = {n: one for n, one in signals.items() if n not in other}, []
+    body = robot.morphology
     modules = {*(m.name for m in body.modules), *body.thruster_names}
     for name, source in columns.items():
         match, number = _SOURCE.match(source), _finite(source)
@@ -279,8 +283,8 @@ def _read_csv(
         late = int(np.flatnonzero(steps <= 0)[0]) + 1
         word = "goes back" if steps[late - 1] < 0 else "stands still"
         raise InputError(
-            f"row {lines[late + 1]}: expected a time later than {time[late - 1]:g} s; found "
-            f"{time[late]:g} s: time {word}"
+            f"row {lines[late + 1]}: expected a time later than {time[late - 1]:.13g} s; found "
+            f"{time[late]:.13g} s: time {word}"
         )
     found = {}
     for name, (k, scale) in named.items():
@@ -331,6 +335,8 @@ def _name_columns(
             bare = f"mark.{mark[2]}.{mark[1]}"
         head, _, rest = bare.partition(".")
         known = bare == "time" or bare in _POSE or bare in _SENSED or head == "mark"
+        if known and bare != "time" and k in mapped:
+            continue  # the map says what it is
         if bare not in found and (known or (head in ("command", "angle") and rest in modules)):
             found[bare] = k, factor
         elif head in ("command", "angle") and rest not in modules and k not in mapped:
@@ -589,6 +595,13 @@ def _check_signals(signals: Mapping[str, TimeSeries], robot: Robot) -> list[str]
                 f"{name}: expected commands within {list(jet.range)}; found {most:.3g}: percent? "
                 f"(--map {name}=COLUMN*0.01)"
             )
+    if (depth := signals.get("depth")) is not None:
+        middle = float(np.median(depth.value))
+        if middle < -float(body_geometry(robot).length):
+            raise InputError(
+                f"depth: expected that of a robot in water, above 0 m; found {middle:.3g} m: a "
+                "height? (--map depth=COLUMN*-1)"
+            )
     if all(name in signals for name in quat):
         length = np.sqrt(sum(np.median(signals[name].value ** 2) for name in quat))
         if not 0.5 < length < 1.5:
@@ -608,7 +621,8 @@ def _check_signals(signals: Mapping[str, TimeSeries], robot: Robot) -> list[str]
     if most < 3 and "mean_speed" not in signals:
         raise InputError(f"expected three frames or more; found {most}")
     _check_motion(signals, robot)
-    notes = [*_gaps(frames), *_sampled_commands(signals, frames, robot)]
+    angles = {n: s for n, s in signals.items() if n.startswith("angle.")}
+    notes = [*_gaps(frames | angles), *_sampled_commands(signals, frames, robot)]
     times = [signal.time for signal in frames.values() if len(signal.time) > 2]
     every = [(float(np.median(np.diff(time))), time[-1] - time[0]) for time in times]
     if every and min(every)[0] > _SLOW:
@@ -664,7 +678,7 @@ def _check_jump(name: str, signal: TimeSeries, length: float) -> None:
         if away and min(len(before), len(after)) > _STAYS / 2:
             raise InputError(
                 f"{name}: expected a way without jumps; found one of {abs(step[k - 1]):.3g} m at "
-                f"{time[k]:g} s: another origin, or another robot, from there on?"
+                f"{time[k]:.13g} s: another origin, or another robot, from there on?"
             )
 
 
@@ -700,7 +714,7 @@ def _gaps(signals: Mapping[str, TimeSeries]) -> list[str]:
         usual = float(np.median(steps))
         lost = np.round(steps / usual) - 1
         single, long = int((lost == 1).sum()), steps[steps > GAP * usual]
-        group = name.partition(".")[0] if name.startswith("mark.") else "frames"
+        group = {"mark": "mark", "angle": "angles"}.get(name.partition(".")[0], "frames")
         if single or len(long):
             words = f"{group} at {1 / usual:.3g} Hz: {single} dropped"
             if len(long):

@@ -89,8 +89,7 @@ def test_servos_at_full_torque_press_less_than_2_mm(timestep):
     robot = jaw(timestep=timestep)
     qpos, qvel = open_jaw(robot)
     qpos = march(robot, 2.0, qpos, qvel, INWARDS)[1]
-    deep = depths(robot, qpos)
-    assert deep.max() < 2e-3
+    assert depths(robot, qpos).max() < 2e-3
     assert np.abs(qpos[-1, 7:] - INWARDS).max() > 0.05  # they do press
     # At 20 ms the end stop that one arm is pressed against lets go in every other step.
     assert np.ptp(qpos[-20:, 7:], 0).max() < 1e-3

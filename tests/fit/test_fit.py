@@ -618,8 +618,12 @@ def test_prescribed_hinges_follow_what_was_measured():
     np.testing.assert_allclose(angle, hip, atol=2e-3)
     with pytest.raises(InputError, match=r"commands .* as they are free; found none of left_hip"):
         make_problem(robot, [recording], ["servo_speed"], FitSettings())
-    course = np.cumsum(np.random.default_rng(0).normal(size=20))
-    assert course_targets(course, 0.01).shape == (18,)
+    assert course_targets(np.random.default_rng(0).normal(size=20), 0.01).shape == (18,)
+    # What swims on while a hinge is not known is not fitted.
+    late = TimeSeries(time[40:], hip[40:])
+    partly = replace(recording, signals=recording.signals | {"angle.left_hip": late})
+    position = make_problem(robot, [partly], ["drag"], FitSettings(held_out=0.0)).channels[0].seen
+    assert np.isnan(position[1:40]).all() and np.isfinite(position[60:]).any()
 
 
 class Stop(Interrupts):
