@@ -249,8 +249,9 @@ def _read_csv(
     if not rows:
         raise InputError("expected a line of column names and rows of numbers; found an empty file")
     header = [cell.strip() for cell in rows[0]]
-    if len(header) == 1 and ";" in header[0]:
-        raise InputError("expected columns with commas between them; found semicolons")
+    for sign, words in ((";", "semicolons"), ("\t", "tabs")):
+        if len(header) == 1 and sign in header[0]:
+            raise InputError(f"expected columns with commas between them; found {words}")
     if len(rows) < 3:
         raise InputError(f"expected rows of numbers below the names; found {len(rows) - 1}")
     values = np.full((len(rows) - 1, len(header)), np.nan)
