@@ -54,7 +54,7 @@ _FAILED = """Frames are those of `docs/glossary.md`; heights are those of the ro
 A rollout that is no longer finite counts as blown up, with a score of -1000; so does one that gets
 farther from its start than a robot could in the episode: at √(9 + F) m/s (F the thrusters' newtons)
 and the water's own velocity (currents, shear, field and gusts; waves go round), with its length
-and, if it sinks, its free fall."""
+and, if it sinks, its free fall. Lower scores of a task of your own count as -1000: scale them."""
 
 
 def meanings(kind: type) -> dict[str, str]:

@@ -139,8 +139,7 @@ def test_the_tables_of_measures_are_the_codes():
     found = re.findall(r"^\| `(\w+)` \| ([^|]+?) \|", text, re.MULTILINE)
     units = {name: measure.unit for name, measure in MEASURES.items()}
     assert found == [*(descriptors.UNITS | units | gait.UNITS).items()]
-    said = {*re.findall(r"\w+", descriptors.describe.__doc__)}
-    assert {*descriptors.UNITS} <= said
+    assert {*descriptors.UNITS} <= {*re.findall(r"\w+", descriptors.describe.__doc__)}
 
 
 @pytest.mark.slow

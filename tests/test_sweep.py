@@ -3,6 +3,7 @@
 import csv
 import os
 import re
+import shutil
 import signal
 
 import numpy as np
@@ -76,6 +77,10 @@ def test_a_sweep_is_a_grid_of_ordinary_runs_with_one_report(folder, no_pictures,
     # Of two and two values, the rank test gives a third at the least.
     assert "2 seeds each: p = " in page
     assert "it is 0.33 at the" in page
+    shutil.copytree(folder / "out", "part")
+    shutil.rmtree("part/strategy=SNES/seed_1")
+    assert run_command(report.main, ["part"]) == 0
+    assert "Nothing is tested" in (folder / "part" / "report.html").read_text()
     assert '<a href="strategy=CMA_ES/seed_1/">seed_1</a>' in page
 
     # Again: nothing to do. More seeds: only those.

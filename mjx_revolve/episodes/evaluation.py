@@ -16,7 +16,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 from numpy.typing import ArrayLike
 
 from mjx_revolve.control.controller import Controller
@@ -39,6 +39,7 @@ from mjx_revolve.episodes.rollout import (
     with_variation,
 )
 from mjx_revolve.episodes.scoring import (
+    LEAST,
     WORST,
     Scores,
     average_trials,
@@ -377,10 +378,19 @@ class EpisodeSpec(ABC, Generic[B]):
             The scores.
         """
         score, measures = self.judge_track(track, position[2], geometry, context)
+        sane = jnp.isfinite(score) & self._is_near(track, position, geometry)
+        return Scores(jnp.where(sane, jnp.maximum(score, LEAST), WORST), sane, measures)
+
+    def _is_near(
+        self,
+        track: dict[str, jax.Array],
+        position: Float[Array, "3 lanes"],
+        geometry: BodyGeometry,
+    ) -> Bool[Array, " lanes"]:
+        """Whether robots have stayed where a robot can get, see `max_distance`."""
         away = jnp.max(jnp.abs(track["position"] - position), (0, 1))
         # Written so that NaN counts as too far.
-        sane = jnp.isfinite(score) & (away < max_distance(self.settings, self.world, geometry))
-        return Scores(jnp.where(sane, score, WORST), sane, measures)
+        return away < max_distance(self.settings, self.world, geometry)
 
     def score_so_far(
         self,
@@ -409,8 +419,9 @@ class EpisodeSpec(ABC, Generic[B]):
         found = self.score(track, position, geometry, context)
         first = first_scored_row(self.settings, self.world.timestep)
         counts = clock >= (first + 1) * self.record_every
-        score = jnp.where(found.sane, jnp.where(counts, found.score, 0.0), WORST)
-        return score, found.sane
+        # Before anything counts, a task's score may be 0 / 0: only the way says what blew up.
+        sane = jnp.where(counts, found.sane, self._is_near(track, position, geometry))
+        return jnp.where(sane, jnp.where(counts, found.score, 0.0), WORST), sane
 
     def judge_track(
         self,

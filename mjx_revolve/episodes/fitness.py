@@ -171,19 +171,22 @@ class Fitness(EpisodeSpec[tuple[()]]):
             variation=self.variation(key, trial),
         )
 
-    def judge(self, trajectory: Trajectory, key: jax.Array) -> tuple[float, dict[str, float]]:
+    def judge(
+        self, trajectory: Trajectory, key: jax.Array, trial: int = 0
+    ) -> tuple[float, dict[str, float]]:
         """Scores one episode, as evolution does, from its trajectory.
 
         Args:
-            trajectory: from `replay(genes, key)`, all rows.
+            trajectory: from `replay(genes, key, trial)`, all rows.
             key: draws its start.
+            trial: its number.
 
         Returns:
             The score, NaN where the rollout blew up, and the measures.
         """
         every, steps, dt = self.record_every, self.num_timesteps, self.world.timestep
         rows = slice(every - 1, steps, every)
-        water = self.water(key) or water_of(self.world)
+        water = self.water(key, trial) or water_of(self.world)
         if self.world.waves:
             water = water._replace(time=water.time + dt * jnp.arange(steps))
         command = trajectory.command
@@ -192,9 +195,9 @@ class Fitness(EpisodeSpec[tuple[()]]):
             jnp.zeros((0, self.num_records)) if command is None else jnp.asarray(command)[rows].T,
             jnp.asarray(trajectory.power * dt).reshape(-1, every).sum(1)[:, None],
             jax.tree.map(lambda x: jnp.broadcast_to(x, (steps,))[rows], water),
-            self.start_point(self.geometry, self.draw_starts(key))[:, :1],
-            jax.tree.map(lambda x: jnp.asarray(x)[..., None], self.context(key)),
-            self.variation(key),
+            self.start_point(self.geometry, self.draw_starts(key))[:, trial : trial + 1],
+            jax.tree.map(lambda x: jnp.asarray(x)[..., None], self.context(key, trial)),
+            self.variation(key, trial),
             None if trajectory.target is None else jnp.asarray(trajectory.target)[rows],
         )
         return float(score[0]), {name: float(value[0]) for name, value in measures.items()}
@@ -600,6 +603,11 @@ def make_mixed_fitness(
     """
     config = _read(config, overrides)
     config.require_population("as bodies differ")
+    for place, value in (("hinges", hinges), ("rows", rows), ("modules", modules)):
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
+            raise InputError(place, "a whole number >= 0", repr(value))
+    if isinstance(examples, Morphology | str):
+        raise InputError("examples", "a list of morphologies", repr(examples)[:60])
     world, task = _place(config)
     robots = [_build(config, world, morphology) for morphology in examples]
     for robot in robots:

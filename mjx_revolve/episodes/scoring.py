@@ -23,9 +23,9 @@ from mjx_revolve.water.flow import drift_speed
 from mjx_revolve.water.world import World
 
 # Score of a rollout that blew up. Finite, because optimisers' averages and sorts are not made for
-# infinities, and below anything that a task gives: lower scores of its own count as `_LEAST`.
+# infinities, and below anything that a task gives: lower scores of its own count as `LEAST`.
 WORST = -1e3
-_LEAST = float(np.nextafter(np.float32(WORST), np.float32(0)))
+LEAST = float(np.nextafter(np.float32(WORST), np.float32(0)))
 
 # No robot of hinges swims or sinks this fast: servos, drag and weight allow a tenth of it. A
 # rollout that gets further than this speed allows counts as blown up [m/s].
@@ -158,7 +158,7 @@ def average_trials(scores: Scores, trials: int) -> tuple[jax.Array, dict[str, ja
     mean = lambda x: jnp.mean(x.reshape(-1, trials), 1)  # noqa: E731
     sane = jnp.all(scores.sane.reshape(-1, trials), 1)
     measures = {name: mean(values) for name, values in scores.measures.items()}
-    return jnp.where(sane, jnp.maximum(mean(scores.score), _LEAST), WORST), measures
+    return jnp.where(sane, jnp.maximum(mean(scores.score), LEAST), WORST), measures
 
 
 def replay_key(seed: int) -> jax.Array:

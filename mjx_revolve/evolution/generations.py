@@ -54,6 +54,7 @@ class Champion:
         body: its body, where bodies have evolved.
         individual: its number, where bodies have evolved.
         passport: results of its tests; None: it was not tested.
+        failed: number of those keys from which a rollout failed.
     """
 
     genes: np.ndarray
@@ -65,6 +66,7 @@ class Champion:
     body: Morphology | None = None
     individual: int | None = None
     passport: Passport | None = None
+    failed: int = 0
 
 
 class SearchState(Protocol):
@@ -214,7 +216,8 @@ def choose_candidate(
             with 0 are not judged, and those with more come first.
 
     Returns:
-        The winner's index, and `score`, `std`, `measures`, `key` and `passport` of its `Champion`.
+        The winner's index, and `score`, `std`, `failed`, `measures`, `key` and `passport` of its
+        `Champion`.
 
     Raises:
         InputError: no candidate has a finite score from any start.
@@ -251,6 +254,7 @@ def choose_candidate(
     return winner, {
         "score": float(scores.mean()),
         "std": float(scores.std()),
+        "failed": int((scores <= FAILED_SCORE).sum()),
         "measures": {name: float(values.mean()) for name, values in measures.items()},
         "key": replay_key(seed),
         "passport": passport,

@@ -384,6 +384,8 @@ class Run:
         }
         if champion.individual is not None:
             facts["individual"] = champion.individual
+        if champion.failed:
+            facts["failed_starts"] = champion.failed
         self.folder.save_champion(champion.genes, champion.body, final=True, **facts)
         (self.folder.path / PASSPORT).unlink(missing_ok=True)  # an earlier choice's
         champion = self._judge(champion, say)

@@ -12,6 +12,7 @@ from mjx_revolve.episodes.scoring import REPORT_EPISODES
 from mjx_revolve.episodes.tasks import score_unit
 from mjx_revolve.evolution.generations import Champion
 from mjx_revolve.evolution.run import Run
+from mjx_revolve.evolution.strategies import FAILED_SCORE
 from mjx_revolve.formats.mjcf import make_mjcf
 from mjx_revolve.view.body_pictures import plot_best
 from mjx_revolve.view.colony_history import read_history
@@ -28,7 +29,10 @@ def describe_score(champion: Champion, config: Config) -> str:
     unit = score_unit(config.task.type, config.task.unit)
     score = f"{champion.score:.3g} ± {champion.std:.2g} {unit}".rstrip()
     mark = (champion.passport.mark or "passes its passport") if champion.passport else ""
-    return f"{score}, mean ± SD over {REPORT_EPISODES} fresh starts" + (f"; {mark}" if mark else "")
+    found = f"{score}, mean ± SD over {REPORT_EPISODES} fresh starts"
+    if champion.failed:
+        found += f"; {champion.failed} of them failed, and count as {FAILED_SCORE:g}"
+    return found + (f"; {mark}" if mark else "")
 
 
 def save_pictures(run: Run, champion: Champion) -> None:

@@ -146,7 +146,9 @@ def difference(values: ArrayLike, others: ArrayLike) -> Interval:
         return Interval(mean, math.nan, count)
     if not np.ptp(x) and not np.ptp(y):
         return Interval(mean, 0.0, count)
-    ends = stats.ttest_ind(x, y, equal_var=False).confidence_interval(LEVEL)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of equal values in one of the two
+        ends = stats.ttest_ind(x, y, equal_var=False).confidence_interval(LEVEL)
     return Interval(mean, float(ends.high - ends.low) / 2, count)
 
 

@@ -121,8 +121,7 @@ def test_fluid_table_of_the_catalogue():
     assert fluid.exposed[0] == pytest.approx(1.0)
     assert face_drag(robot).linear[0] == pytest.approx(0.5 * 999.1026 * 1.05 * faces)
     assert fluid.center_of_volume[0] == pytest.approx(0.0)
-    plates = LIFT_DRAG.numbers(fluid, robot.world)
-    assert plates.area[0] == pytest.approx(0.089 * 0.089)
+    assert LIFT_DRAG.numbers(fluid, robot.world).area[0] == pytest.approx(0.089 * 0.089)
     # Of two bricks in a row, the outer carries less water along it: a face of it is joined.
     two = "body: {type: Core, children: {1: {type: FixedBrick, children: {1: {type: FixedBrick}}}}}"
     outer = build_robot(read(two), world()).fluid.added_mass[2]
@@ -182,8 +181,7 @@ def test_an_edited_model_is_a_new_robot(kind):
         edit.actuator_biasprm[:, 1] = -stiff
         implicit = robot.with_model(edit).assembly.implicit_stiffness[2:]
         assert implicit.min() > 0 if stiff else not implicit.any()
-    again = pickle.loads(pickle.dumps(other))
-    assert again.mj_model.dof_damping[9] == 0.5
+    assert pickle.loads(pickle.dumps(other)).mj_model.dof_damping[9] == 0.5
     need_mjx()
     assert make_engine(other, "mjx").robot.mj_model.dof_damping[9] == 0.5
 

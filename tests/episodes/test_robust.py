@@ -89,3 +89,5 @@ def test_one_body_and_many_and_its_replay(settings):
     with pytest.raises(InputError, match=r"key: expected jax\.random\.key"):
         one.replay(np.zeros(one.num_genes), 0)
     assert score == pytest.approx(float(one(genes[:1], KEY)[0]), rel=1e-3)
+    both = [fitness.judge(fitness.replay(genes[0], KEY, trial=k), KEY, k)[0] for k in (0, 1)]
+    assert np.mean(both) == pytest.approx(float(scores[0]), rel=1e-3)

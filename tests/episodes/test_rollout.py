@@ -46,7 +46,8 @@ def test_depths_are_below_the_surface_of_the_water_that_is_given():
     moved = np.array(higher.qpos)
     moved[:, 2] -= 5.0
     assert moved == pytest.approx(np.array(at_home.qpos), abs=1e-6)
-    own, other = (analyse_motion(robot, x).depth for x in (at_home, higher))
+    motions = (analyse_motion(robot, x) for x in (at_home, higher))
+    own, other = (motion.surface - motion.path[:, 2] for motion in motions)
     assert own[0] == pytest.approx(1.0, abs=1e-3)
     assert own[-1] == pytest.approx(2.0, abs=0.05)
     assert other == pytest.approx(own, abs=1e-6)
@@ -83,8 +84,7 @@ def test_all_forms_of_joint_targets(elbow, still):
     assert np.array_equal(rows.qpos, held.qpos)
     timed = simulate(elbow, lambda t: jnp.array([0.3, -0.2]) * (t >= 0), SPAN)
     assert np.array_equal(timed.qpos, held.qpos)
-    zero = simulate(elbow, [0, 0], SPAN)
-    assert np.array_equal(zero.qpos, still.qpos)
+    assert np.array_equal(simulate(elbow, [0, 0], SPAN).qpos, still.qpos)
     assert np.abs(held.qpos - still.qpos).max() > 0.01
     # The function sees the time at the start of each step.
     clock = simulate(elbow, lambda t: jnp.array([t, 0.0]), SPAN)

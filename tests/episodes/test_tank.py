@@ -68,8 +68,7 @@ def test_alone_it_swims_as_in_an_episode(tank, mixed, robots):
     own = genes(mixed, robot)
     [trajectory] = mixed.replay([robot], [own], jax.random.key(0))
     water = tank()
-    start = np.asarray(trajectory.qpos[0])
-    assert np.allclose(start[:2], 0, atol=1e-3)
+    assert np.allclose(np.asarray(trajectory.qpos[0])[:2], 0, atol=1e-3)
     water.add(robot, own, (0, 0, -2), noise=int(mixed.draw_starts(jax.random.key(0)).noise[0]))
     trail = water.advance(2.0, 0.02)
     count = 7 + robot.num_hinges

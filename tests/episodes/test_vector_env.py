@@ -1,6 +1,7 @@
 """Gymnasium's vector environment: rewards add up to scores, episodes follow from seeds."""
 
 import sys
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -121,6 +122,11 @@ def test_a_target_that_drifts_stands_in_the_score_so_far(config):
     scores = [fitness.score_so_far(track, start, fitness.geometry, context, k)[0] for k in clocks]
     way = 0.1 * fitness.record_every * fitness.world.timestep / fitness.geometry.stretched
     assert np.abs(np.diff(scores, axis=0)).max() <= 1.01 * way and abs(scores[-1]) > way
+    # A task's score that is none before it counts ends no episode.
+    nothing = replace(fitness, task=replace(fitness.task, score=lambda *_: jnp.full(1, jnp.nan)))
+    for k, expected in ((clocks[0], (0, True)), (clocks[-1], (WORST, False))):
+        found = nothing.score_so_far(track, start, fitness.geometry, context, k)
+        assert (float(found[0][0]), bool(found[1][0])) == expected
 
 
 @pytest.mark.slow

@@ -55,8 +55,7 @@ def test_chargers_share_their_power():
     """Within reach robots get the most; beyond, power falls as 1/d²; many robots share it."""
     energy = EnergyConfig(power=1.0, most=0.5, reach=1.0)
     assert share_power(np.array([[0.5, 2.0]]), energy) == pytest.approx([0.5, 0.125])
-    crowd = share_power(np.full((1, 8), 0.2), energy)
-    assert crowd == pytest.approx(1 / 8)
+    assert share_power(np.full((1, 8), 0.2), energy) == pytest.approx(1 / 8)
     assert share_power(np.array([[0.5], [0.5]]), energy) == pytest.approx([0.5])
 
 

@@ -206,8 +206,7 @@ def test_a_sensor_of_what_is_held_out_alone_inflates_nothing(auv, signals):
     deep = seen | {"depth": TimeSeries(filmed["z"].time, -filmed["z"].value)}
     given = [RobotRecording(name, deep if name == "d" else seen) for name in "abcd"]
     problem = make_problem(auv, given, ["drag"], FitSettings())
-    left = linearize(problem, problem.origin()).values
-    assert correlation(problem, left)["depth"] == 1.0
+    assert correlation(problem, linearize(problem, problem.origin()).values)["depth"] == 1.0
     # Rows of another sensor between them take nothing from what errs together in time.
     late = {n: TimeSeries(x.time + 1e-3 * (n[0] == "q"), x.value) for n, x in seen.items()}
     pair = [

@@ -115,8 +115,7 @@ def test_bag_joint_states_are_the_trajectorys(bag, episode):
     ctrl = np.asarray(trajectory.ctrl)[rows]
     found = [message.position for _, message in bag.topics["/joint_targets"]]
     np.testing.assert_allclose(found, ctrl[:, list(robot.servos)])
-    label = bag.topics["/thruster_commands"][0][1].layout.dim[0].label
-    assert label == "jet"
+    assert bag.topics["/thruster_commands"][0][1].layout.dim[0].label == "jet"
     found = [message.data[0] for _, message in bag.topics["/thruster_commands"]]
     np.testing.assert_allclose(found, np.asarray(trajectory.command)[rows, 0])
 

@@ -93,8 +93,7 @@ def test_the_same_innovation_has_the_same_number():
         rng = np.random.default_rng(seed)
         return draw_cppn(rng, 1, 1, settings).nodes[0].number
 
-    one = CPPNSettings(first_nodes=1)
-    assert len({split(seed, one) for seed in range(5)}) == 1
+    assert len({split(seed, CPPNSettings(first_nodes=1)) for seed in range(5)}) == 1
     foreign = CPPNSettings(first_nodes=1, innovations=False)
     assert len({split(seed, foreign) for seed in range(5)}) == 5
 

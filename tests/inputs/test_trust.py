@@ -195,8 +195,7 @@ def test_names_move_no_cursor_and_write_no_markup(folder, capsys):
     body.write_text(body.read_text().replace("id:", f"id: {json.dumps(nasty)} # ", 1))
     assert run_command(report.main, ["run", "--out", "report.html"]) == 0
     assert run_command(viewer.main, ["run", "--out", "page.html"]) == 2
-    shown = "".join(capsys.readouterr()).replace("\n", "")
-    assert shown.isprintable()
+    assert "".join(capsys.readouterr()).replace("\n", "").isprintable()
     page = (folder / "report.html").read_text()
     assert "<script>alert" not in page and "<b>x</b>" not in page
     assert not any(c in page for c in "\x1b\x07\u202e")

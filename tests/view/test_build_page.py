@@ -77,8 +77,7 @@ def test_what_modules_hold_is_told_apart_and_stands_where_it_must():
     body = read(f"body: {{type: Core, children: {{{', '.join(bricks)}}}}}")
     assert [len(some) for some in list_parts(body)] == [1, 2, 1]
     robot = bench("{electronics_volume: 50.54e-6, center_of_volume: [0, .01, 0]}")
-    page = make_build_page(robot, "x")
-    assert "50.54 cm³ of sealed volume at (0, 20, 0) mm" in page
+    assert "50.54 cm³ of sealed volume at (0, 20, 0) mm" in make_build_page(robot, "x")
 
 
 def said(pattern, robot):

@@ -271,7 +271,7 @@ def write_pages(record: RunRecord, numbers: Sequence[int]) -> int:
 
 def viewer_command(record: RunRecord, *options: object) -> str:
     """The command line that shows a run, or an individual of it, in a browser."""
-    return shlex.join(["python", "-m", "mjx_revolve.viewer", record.label, *map(str, options)])
+    return shlex.join(["python", "-m", "mjx_revolve.viewer", record.path, *map(str, options)])
 
 
 def inline_svg(svg: bytes) -> str:

@@ -206,6 +206,8 @@ def _read_champion(record: RunRecord) -> None:
     judged = record.info.get("champion")
     if isinstance(judged, dict):  # the same facts, and there even where genes.yaml is not
         record.champion = record.champion | judged
+    if failed := record.champion.get("failed_starts"):
+        record.note("failed", f"{failed} of the champion's fresh starts; its score counts them")
     if not run.checkpoints():
         record.note("missing", "checkpoints/ has none: the run cannot be resumed")
 

@@ -28,6 +28,7 @@ KINDS = {
     "damaged": "damaged",
     "missing": "incomplete",
     "unfinished": "not finished",
+    "failed": "failed",
     "untrusted": "not shown in full",
     "version": "of another version",
     "changed": "changed",
@@ -79,6 +80,12 @@ class RunRecord:
     champion: dict[str, Any] = field(default_factory=dict)
     passport: Passport | None = None
     problems: list[Problem] = field(default_factory=list)
+
+    @property
+    def path(self) -> str:
+        """Of the folder, for commands: the label of one that is worked in is a name alone."""
+        path = self.label.rstrip("/")
+        return path if Path(path).is_dir() else str(self.folder)
 
     def note(self, kind: str, text: str) -> None:
         """Adds a problem once, without the folder's path."""

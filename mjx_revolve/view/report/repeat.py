@@ -26,7 +26,7 @@ def repeat_command(record: RunRecord) -> str:
               if isinstance(value, str) and value != "1"]  # fmt: skip
     if isinstance(flags, str) and flags:
         before.append(f"XLA_FLAGS={shlex.quote(flags)}")
-    place = record.label.rstrip("/")
+    place = record.path
     words = ["python", "-m", "mjx_revolve.evolve", f"{place}/config.yaml"]
     return " ".join([*before, shlex.join([*words, "--out", f"{place}-again"])])
 

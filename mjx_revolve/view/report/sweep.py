@@ -206,19 +206,23 @@ def _tests(members: Numbered, cases: Sequence[str]) -> str:
         return ""
     scores = {letter(k): _values(found, "score") for k, found in members.items()}
     names = {letter(k): cases[k] for k in members}
-    counts = sorted(map(len, scores.values()))
-    said = f"{counts[0]}" if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
+    counts = sorted(n for x in scores.values() if (n := len(x)) > 1)
+    said = "" if len(counts) < 2 else "all cases, "
+    if said and len(counts) < len(scores):
+        said = "the cases with two seeds or more, "
+    if said:
+        said += f"{counts[0]}" if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
     found = compare(scores, pairs=len(members) <= _MOST_TESTED)
     rows = [
         [
             f"{a} − {b}", names[a], names[b], str(difference(scores[a], scores[b])),
-            f"{len(scores[a])} + {len(scores[b])}", _p(p),
+            f"{len(scores[a])} + {len(scores[b])}",
+            _p(p) if min(len(scores[a]), len(scores[b])) > 1 else "not tested",
         ]
         for (a, b), p in found.pairs.items()
     ]  # fmt: skip
-    several = sum(count > 1 for count in counts)
-    pairs = several * (several - 1) // 2
-    least = smallest_p(counts[-1], counts[-2], pairs) if rows else 1.0
+    pairs = len(counts) * (len(counts) - 1) // 2
+    least = smallest_p(counts[-1], counts[-2], pairs) if rows and said else 1.0
     return sections.sweep_tests(_p(found.p), said, rows, f"{least:.2g}", ALPHA, _MOST_TESTED)
 
 
