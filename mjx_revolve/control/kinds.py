@@ -126,7 +126,9 @@ def _check_users_controller(name: str, controller: object, plant: Plant) -> None
             known = f"any of {', '.join(OPTIONAL_SIGNALS)}"
             known += ", or modules such as 'at ID' and 'each TYPE'"
             raise InputError(f"{place}: signals", known, repr(signal))
-    lanes, rows = 7, plant.num_rows
+    # A plant of different bodies has a column for each; one of one body goes with any number.
+    wide, rows = plant.source.shape[-1], plant.num_rows
+    lanes = wide if wide > 1 else 7
     with reading(f"{place}: signals"):
         readings = jax.eval_shape(lambda: readings_at_rest(plant, lanes, controller.signals))
 
@@ -137,8 +139,8 @@ def _check_users_controller(name: str, controller: object, plant: Plant) -> None
             if not hasattr(x, "ndim"):
                 raise InputError("init", "a state of arrays [..., lanes]", repr(x))
             if x.ndim and x.shape[-1] != lanes and jnp.issubdtype(x.dtype, jnp.floating):
-                wide = f"a state of arrays [..., lanes], here {lanes}"
-                raise InputError("init", wide, _shapes(x))
+                known = f"a state of arrays [..., lanes], here {lanes}"
+                raise InputError("init", known, _shapes(x))
         return state, *controller.step(parameters, state, time, sense)
 
     genes, time = jnp.zeros((count, lanes), jnp.float32), jnp.zeros((), jnp.float32)
