@@ -126,7 +126,7 @@ def _check_users_controller(name: str, controller: object, plant: Plant) -> None
             known = f"any of {', '.join(OPTIONAL_SIGNALS)}"
             known += ", or modules such as 'at ID' and 'each TYPE'"
             raise InputError(f"{place}: signals", known, repr(signal))
-    # A plant of different bodies has a column for each; one of one body goes with any number.
+    # A plant with tables has a column for each robot; that of one body goes with any number.
     wide, rows = plant.source.shape[-1], plant.num_rows
     lanes = wide if wide > 1 else 7
     with reading(f"{place}: signals"):

@@ -635,7 +635,8 @@ def make_mixed_fitness(
     controller_settings = with_sensors(config)
     sites = dict.fromkeys(s.each for s in controller_settings.sensors or () if s.each is not None)
     capacity = fit_capacity(shown, kinds, touches, hinges, rows, modules, tuple(sites))
-    example = jax.tree.map(jnp.asarray, pack_bodies([robots[0]] * 3, capacity)).plant
+    # As many as no other axis has, so that a controller that takes one for the other is noticed.
+    example = jax.tree.map(jnp.asarray, pack_bodies([robots[0]] * 7, capacity)).plant
     controller = _find_controller(config, controller_settings, capacity.plant, example=example)
     return MixedFitness(config, world, task, controller, capacity, touches, controller_settings)
 

@@ -198,9 +198,8 @@ def _mapped(
     """
     # What a map says of a source holds, not the source's own name; commands and angles keep theirs.
     taken = {match["column"] for x in columns.values() if (match := _SOURCE.match(x))}
-    other = {n for n in taken if n in _POSE or n in _SENSED or n.startswith("mark.")}
-    found, notes = {n: one for n, one in signals.items() if n not in other}, []
-    body = robot.morphology
+    found = {n: x for n, x in signals.items() if n not in taken or not _is_measured(n)}
+    notes, body = [], robot.morphology
     modules = {*(m.name for m in body.modules), *body.thruster_names}
     for name, source in columns.items():
         match, number = _SOURCE.match(source), _finite(source)
@@ -218,6 +217,11 @@ def _mapped(
             known = ", ".join(signals)
             notes.append(f"--map {name}: there is no {show(source)}, but {known}: left out")
     return found, notes
+
+
+def _is_measured(name: str) -> bool:
+    """Whether a signal is measured of the whole robot or of its marks."""
+    return name in _POSE or name in _SENSED or name.partition(".")[0] == "mark"
 
 
 def _read_mark(key: str, source: str, robot: Robot) -> MarkedPoint:
@@ -335,9 +339,9 @@ def _name_columns(
         if mark := re.fullmatch(r"([xyz])(\d+)", bare):
             bare = f"mark.{mark[2]}.{mark[1]}"
         head, _, rest = bare.partition(".")
-        known = bare == "time" or bare in _POSE or bare in _SENSED or head == "mark"
-        if known and bare != "time" and k in mapped:
+        if _is_measured(bare) and k in mapped:
             continue  # the map says what it is
+        known = bare == "time" or _is_measured(bare)
         if bare not in found and (known or (head in ("command", "angle") and rest in modules)):
             found[bare] = k, factor
         elif head in ("command", "angle") and rest not in modules and k not in mapped:

@@ -84,8 +84,8 @@ class RunRecord:
     @property
     def path(self) -> str:
         """Of the folder, for commands: the label of one that is worked in is a name alone."""
-        path = self.label.rstrip("/")
-        return path if Path(path).is_dir() else str(self.folder)
+        leads_there = Path(self.label).absolute() == self.folder
+        return self.label.rstrip("/") if leads_there else str(self.folder)
 
     def note(self, kind: str, text: str) -> None:
         """Adds a problem once, without the folder's path."""

@@ -207,11 +207,11 @@ def _tests(members: Numbered, cases: Sequence[str]) -> str:
     scores = {letter(k): _values(found, "score") for k, found in members.items()}
     names = {letter(k): cases[k] for k in members}
     counts = sorted(n for x in scores.values() if (n := len(x)) > 1)
-    said = "" if len(counts) < 2 else "all cases, "
-    if said and len(counts) < len(scores):
-        said = "the cases with two seeds or more, "
-    if said:
-        said += f"{counts[0]}" if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
+    said = ""  # of what is tested: nothing
+    if len(counts) > 1:
+        whole = len(counts) == len(scores)
+        seeds = f"{counts[0]}" if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
+        said = f"{'all cases' if whole else 'the cases with two seeds or more'}, {seeds}"
     found = compare(scores, pairs=len(members) <= _MOST_TESTED)
     rows = [
         [
