@@ -98,7 +98,7 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     try:
         # From the first heavy import on: some of them swallow a KeyboardInterrupt, or die of it.
         with Interrupts() as interrupts, contextlib.ExitStack() as executors:
-            runtime.fix_threads()
+            runtime.fix_environment()
             return _lead(arguments, make_fitness, executors, interrupts)
     except WorkerError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -119,7 +119,7 @@ def main(argv: list[str] | None = None) -> int:
     if not files and Path(arguments.path).is_dir():
         check_place(Path(arguments.path) / "any", arguments.path)
     check_episode_path(arguments.path)
-    runtime.fix_threads()
+    runtime.fix_environment()
     from mjx_revolve.episodes.early_checks import check_episode_files
 
     no_genes = InputError("--controller", "a champion", "a morphology, which has no genes")

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from mjx_revolve.inputs.commands import Parser, program, read_path, read_world, run_command, whole
 from mjx_revolve.inputs.errors import plain
 from mjx_revolve.inputs.trust import add_trust_argument, opening
-from mjx_revolve.numerics.runtime import fix_threads, prepare_process
+from mjx_revolve.numerics.runtime import fix_environment, prepare_process
 
 if TYPE_CHECKING:
     from mjx_revolve.view.live.simulation import LiveSimulation
@@ -56,7 +56,7 @@ def main(argv: list[str] | None = None) -> int:
     add_trust_argument(parser)
     arguments = parser.parse_args(argv)
     named = [*arguments.paths, *([arguments.world] if arguments.world else [])]
-    fix_threads()
+    fix_environment()
     from mjx_revolve.episodes.early_checks import check_live_files
 
     with opening(*named, trust=arguments.trust):

@@ -36,7 +36,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("run", type=read_path, metavar="RUN", help="a run folder")
     add_trust_argument(parser)
     arguments = parser.parse_args(argv)
-    runtime.fix_threads()
+    runtime.fix_environment()
     from mjx_revolve.episodes.run_reader import RunReader, find_run
 
     # While programs are compiled, only a thread of its own can end the process.

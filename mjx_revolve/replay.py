@@ -33,7 +33,7 @@ from mjx_revolve.inputs.commands import (
 from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import short_path
 from mjx_revolve.inputs.packages import check_package
-from mjx_revolve.numerics.runtime import fix_threads, prepare_process
+from mjx_revolve.numerics.runtime import fix_environment, prepare_process
 from mjx_revolve.view.film.opengl import find_opengl
 
 if TYPE_CHECKING:
@@ -161,7 +161,7 @@ def main(argv: list[str] | None = None) -> int:
     wanted = kinds if paths is None else paths
     if ".mp4" in wanted:
         check_package("MP4", "av")
-    fix_threads()
+    fix_environment()
     from mjx_revolve.episodes.early_checks import check_episode_files
 
     check_episode_files(arguments)

@@ -102,7 +102,7 @@ def main(argv: list[str] | None = None) -> int:
         OSError: the page cannot be written.
     """
     arguments = _parser().parse_args(argv)
-    runtime.fix_threads()
+    runtime.fix_environment()
     from mjx_revolve.episodes.run_reader import check_runs
 
     check_runs(arguments.runs)

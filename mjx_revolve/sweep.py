@@ -81,7 +81,7 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     arguments = _parser().parse_args(argv)
     check_run_arguments(arguments)
     path = find_shipped(arguments.config, "configs").absolute()
-    runtime.fix_threads()
+    runtime.fix_environment()
     _check_configs(path, arguments.settings, arguments.trust)
     print(plain(f"loading {arguments.config}"), flush=True)  # it takes seconds
     runtime.prepare_process()

@@ -71,7 +71,7 @@ def main(argv: list[str] | None = None) -> int:
     if arguments.colony:
         return _write_colony(arguments)
     # JAX takes seconds to import: not for `--help`, nor for wrong files.
-    runtime.fix_threads()
+    runtime.fix_environment()
     from mjx_revolve.episodes.early_checks import check_episode_files
 
     check_episode_files(arguments)

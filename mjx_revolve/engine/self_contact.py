@@ -50,7 +50,7 @@ _MOST = 8
 # needs, so that 256 random bodies step a third faster by fours than by eights; one at a time is a
 # third slower where all touch. Pairs of spheres, and of boxes, that are compared at a time: enough
 # for vector registers. Choices.
-_ROBOTS, _SPHERES, _PAIRS = 4, 64, 32
+_ROBOTS, _SPHERES, _PAIRS = 4, 32, 16
 # Pairs that are near which are listed at a time, where loops need no known length. A choice.
 _ROOM = 256
 # Flags in a word.

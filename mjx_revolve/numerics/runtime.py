@@ -30,6 +30,10 @@ except ImportError:  # not on Windows: there, each process compiles
 
 # CMA-ES's eigendecomposition gives other bits with other numbers of BLAS threads.
 _THREAD_SETTINGS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+# LLVM unrolls loops of up to some twenty passes before it looks for vectors, and then finds none.
+# Robots that touch themselves are computed by fours: with loops kept, 256 random bodies step a
+# fifth faster, and programs compile in a tenth less time; the bits are the same.
+_LLVM = "--xla_backend_extra_options=-unroll-full-max-count=1"
 _PACKAGES = (
     "mjx_revolve", "jax", "jaxlib", "mujoco", "mujoco-mjx", "evosax", "numpy", "scipy",
 )  # fmt: skip
@@ -50,10 +54,21 @@ _xla_cores: int | None = None
 _programs: Path | None = None
 
 
-def fix_threads() -> None:
-    """Fixes the thread settings that NumPy reads when it is imported."""
+def fix_environment() -> None:
+    """Fixes what NumPy reads when it is imported, and XLA when it starts: threads, LLVM's options.
+
+    Options that a user gives LLVM take the place of ours.
+    """
     for name in _THREAD_SETTINGS:
         os.environ.setdefault(name, "1")
+    flags = os.environ.get("XLA_FLAGS", "")
+    if expects_cpu() and "xla_backend_extra_options" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {_LLVM}".strip()
+
+
+def user_flags() -> str | None:
+    """XLA's flags in the environment, without that of `fix_environment`."""
+    return os.environ.get("XLA_FLAGS", "").replace(_LLVM, "").strip() or None
 
 
 @contextlib.contextmanager
@@ -67,9 +82,9 @@ def few_collections() -> Iterator[None]:
 
 
 def prepare_process() -> Path | None:
-    """Fixes the thread settings and turns on JAX's persistent compilation cache.
+    """Fixes the environment and turns on JAX's persistent compilation cache.
 
-    Settings that are already in the environment (`OPENBLAS_NUM_THREADS`,
+    Settings that are already there (`OPENBLAS_NUM_THREADS`, `XLA_FLAGS`,
     `JAX_COMPILATION_CACHE_DIR`) are respected, and so is a cache folder that JAX already has;
     an empty `JAX_COMPILATION_CACHE_DIR` turns the cache off. Imports JAX.
 
@@ -82,8 +97,8 @@ def prepare_process() -> Path | None:
 
 
 def find_cache() -> Path | None:
-    """Fixes the thread settings and finds the cache folder of `prepare_process`, without JAX."""
-    fix_threads()
+    """Fixes the environment and finds the cache folder of `prepare_process`, without JAX."""
+    fix_environment()
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if "jax" in sys.modules and (known := sys.modules["jax"].config.jax_compilation_cache_dir):
         chosen = known
@@ -130,7 +145,7 @@ def prepare_worker(core: int | None, cache: str | None) -> None:
         cache: the compilation cache's folder that the main process uses. The main process has
             removed broken entries; the worker does not, as an entry may be in writing.
     """
-    fix_threads()
+    fix_environment()
     os.environ["JAX_PLATFORMS"] = "cpu"
     _use_cache(Path(cache) if cache else None, _WORKER_MIN_COMPILE_TIME)
     if core is not None:
@@ -344,7 +359,7 @@ def describe_process() -> dict[str, object]:
         "cpu_count": usable_cores(),
         "device": jax.devices()[0].device_kind,
         "threads": {name: os.environ.get(name) for name in (*_THREAD_SETTINGS, "NPROC")},
-        "xla_flags": os.environ.get("XLA_FLAGS"),
+        "xla_flags": user_flags(),
     }
 
 
