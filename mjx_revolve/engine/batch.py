@@ -328,7 +328,11 @@ def fit_capacity(
         root_shells = sum(group.root_parts for group in groups)
     if modules:
         count = max(count, _most_rows(columns, groups, modules, hinges))
-        thrusters = (modules - 1) * any(kind.is_thruster for kind in types.values())
+        pushing = {True: 0, False: 0}  # of a core, and of another module
+        for kind in types.values():
+            own = sum(part.thruster is not None for part in kind.parts)
+            pushing[kind.mount is None] = max(pushing[kind.mount is None], own)
+        thrusters = pushing[True] + (modules - 1) * pushing[False]
         points = 8 * sum(group.parts for group in groups) if near else 0
         root_points = 8 * sum(group.root_parts for group in groups) if near else 0
     if rows or hinges or modules:

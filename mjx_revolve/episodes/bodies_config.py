@@ -139,6 +139,9 @@ class ArchiveConfig(Settings):
             raise ConstraintError("axes", f"at most {_MOST_CELLS:,} cells", f"{cells:,}")
         if self.type == "grid" and self.cells != type(self).model_fields["cells"].default:
             note(f"bodies.archive.cells is of cvt: the grid has {cells:,} by its axes")
+        usual = Axis.model_fields["cells"].default
+        if self.type == "cvt" and any(axis.cells != usual for axis in self.axes.values()):
+            note(f"cells of bodies.archive.axes are of a grid: the cvt archive has {self.cells:,}")
         return self
 
 

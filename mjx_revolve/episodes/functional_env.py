@@ -105,7 +105,8 @@ class FunctionalEnv:
     def reset(self, rng: jax.Array) -> WaterState:
         """An episode's start, which follows from the key alone."""
         check_key(rng)
-        state, seen = self._begin(jax.random.bits(rng), jnp.int32(0))
+        # 32 bits with x64, too: more are no seed of `make_vector_env`.
+        state, seen = self._begin(jax.random.bits(rng, (), "uint32"), jnp.int32(0))
         zero = jnp.zeros((), seen.dtype)
         return WaterState(state, seen, zero, zero, {"score": zero}, {"truncation": zero})
 

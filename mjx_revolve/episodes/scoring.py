@@ -16,7 +16,7 @@ from jaxtyping import Array, Int
 
 from mjx_revolve.engine.plant import BodyGeometry
 from mjx_revolve.episodes.config import TaskConfig
-from mjx_revolve.episodes.tasks import Task
+from mjx_revolve.episodes.tasks import Task, start_at_depth
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.bed import highest_bed
 from mjx_revolve.water.flow import drift_speed
@@ -123,10 +123,13 @@ def may_touch_bed(task: Task, settings: TaskConfig, world: World, reach: float) 
     """Whether the bed is within `max_distance` of an episode; if not, the step needs no contact.
 
     `max_distance` is the way at top speed, plus the fall of a robot that sinks. A rollout that
-    gets further counts as blown up, so no robot can pass through a bed that is left out.
+    gets further counts as blown up, so no robot can pass through a bed that is left out. A task's
+    own start may place robots anywhere.
     """
     if world.bed is None:
         return False
+    if task.start is not start_at_depth:
+        return True
     lowest = world.surface_height - settings.depth - reach
     return task.on_bed or lowest < highest_bed(world.bed, reach)
 

@@ -165,7 +165,8 @@ def simulate(
         key: if given, the default start pose is turned at random about the vertical; it also draws
             the world's gusts (`jax.random.key(0)` by default).
         water: surface and current, by default the world's; each a number or `[T]`, a row for each
-            step. It replaces the world's gusts.
+            step. It replaces the world's gusts. A number for the waves' time is that at the start.
+            Where the current changes, give its acceleration, too: without it, none pushes bodies.
         engine: "population" or "mjx".
         once: compile quickly into a slower program; faster in all for a minute or less.
         context: of the sensors, a number each; by default no target, and noise that `key` draws.
@@ -225,6 +226,8 @@ def simulate(
         for leaf in jax.tree.leaves(water):
             if leaf.ndim > 1 or (leaf.ndim == 1 and leaf.shape[0] not in (1, steps)):
                 raise InputError("water", f"numbers or [{steps}]", list(leaf.shape))
+        if water.time.shape == (steps,):  # the rollout adds the time since its start
+            water = water._replace(time=water.time - dt * jnp.arange(steps))
     context = EpisodeContext() if context is None else context
     if context.noise is None:
         noise = noise_key(jax.random.key(0) if key is None else key)

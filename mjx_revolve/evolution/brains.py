@@ -171,9 +171,11 @@ class NamedGenes:
             known = parents
             if gene.place == "robot":
                 return next((brain[name] for brain in parents if name in brain), None)
-            if not origins.keys().isdisjoint(joints):
+            originals = [_original(x, origins) for x in joints]
+            if any(one is not None for one in originals):
                 # A copy may have the name of another joint, which the body lost or a parent has.
-                which, joints = zip(*(origins.get(x, (0, x)) for x in joints), strict=True)
+                pairs = zip(originals, joints, strict=True)
+                which, joints = zip(*(one or (0, x) for one, x in pairs), strict=True)
                 known = [parents[which[0]]] if len(set(which)) == 1 else []
             values = (look(brain, gene, joints) for brain in known)
             return next((value for value in values if value is not None), None)
@@ -207,6 +209,20 @@ class NamedGenes:
     def check(self, brain: object) -> dict[str, float]:
         """Genes by name."""
         return read(_NAMED, brain, "brain")
+
+
+def _original(joint: str, origins: Origins) -> tuple[int, str] | None:
+    """The parent that a joint or thruster was copied from and its name there; None: it is no copy.
+
+    Modules are copied, and one of several joints of a module is named `module/part`.
+    """
+    if joint in origins:
+        return origins[joint]
+    module, slash, part = joint.rpartition("/")
+    if module not in origins:
+        return None
+    which, name = origins[module]
+    return which, f"{name}{slash}{part}"
 
 
 def _named(layout: GeneLayout, values: Iterable[float]) -> dict[str, float]:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from mjx_revolve.body.tree import Morphology
-from mjx_revolve.genotypes.genotype import Genotype, Space
+from mjx_revolve.genotypes.genotype import Genotype, Origins, Space
 from mjx_revolve.genotypes.table import GENOTYPES
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.user_code import (
     call_user_function,
     function_place,
@@ -76,14 +76,20 @@ def _guard(name: str, genotype: object, space: Space) -> Genotype:
             raise InputError(f"{place}: develop: {reason}")
         return body
 
-    return genotype._replace(**functions | {"develop": develop})
+    def settle(genome: object) -> tuple[object, Origins]:
+        found = functions["settle"](genome)
+        if not (isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Mapping)):
+            raise InputError(f"{place}: settle", "(genome, mapping of origins)", show(found))
+        return found
+
+    return genotype._replace(**functions | {"develop": develop, "settle": settle})
 
 
 def _try(name: str, genotype: Genotype) -> None:
     """Makes, develops and saves one child, so that errors show before a run begins."""
     rng, place = np.random.default_rng(0), function_place(name)
     one, other = genotype.random(rng), genotype.random(rng)
-    child = genotype.mutate(rng, genotype.cross(rng, one, other))
+    child, _ = genotype.settle(genotype.mutate(rng, genotype.cross(rng, one, other)))
     body, plain = genotype.develop(child), genotype.to_plain(child)
     try:
         text = json.dumps(plain)

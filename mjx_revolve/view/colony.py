@@ -46,7 +46,9 @@ def record_colony(
     observed, _ = observe_colony(config, fitness, search, begin, duration, _GAP)
     if not observed:
         raise InputError(folder, f"robots alive from {begin:g} s on", "none")
-    start = min(float(one.time[0]) for one in observed) - _GAP
+    # Poses are whole steps apart, which may be less than asked for; the first is one of them late.
+    gaps = [float(one.time[1] - one.time[0]) for one in observed if len(one.time) > 1]
+    start = min(float(one.time[0]) for one in observed) - min(gaps, default=_GAP)
     # A colony is advanced to the end of an interval.
     end = min(start + duration, max(float(one.time[-1]) for one in observed))
     depth = fitness.mixed.world.surface_height - config.task.depth

@@ -248,8 +248,7 @@ def test_own_core_replaces_the_catalogues_under_all_its_names(tmp_path):
     text = "modules: {Core: {mount: null, parts: [{size: [.1, .1, .1], mass: .5}], slots: {1: +y}}}"
     mine = MODULES | load_modules(write(tmp_path, text, "mine.yaml"))
     assert mine["CoreComponent"] is mine["Core"]
-    robot = write(tmp_path, "body: {type: CoreComponent}")
-    assert load_morphology(robot, modules=mine).mass == 0.5
+    assert load_morphology(write(tmp_path, "body: {type: CoreComponent}"), modules=mine).mass == 0.5
 
 
 @pytest.mark.parametrize(

@@ -467,8 +467,7 @@ def test_overlapping_modules_are_named(tmp_path):
         f"{tmp_path / 'robot.yaml'}: body: expected modules that do not overlap at rest; found "
         "overlapping: Core0 and c, Core0 and d (allow_overlap loads them all the same)"
     )
-    robot = read(tmp_path, RING, allow_overlap=True)
-    assert robot.overlaps == (("Core0", "c"), ("Core0", "d"))
+    assert read(tmp_path, RING, allow_overlap=True).overlaps == (("Core0", "c"), ("Core0", "d"))
 
 
 def test_descriptors_of_the_spider(spider):

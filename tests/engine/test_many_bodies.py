@@ -226,6 +226,10 @@ def test_room_for_all_bodies_of_so_many_modules():
     tank = world(drag="inertia_box")
     capacity = fit_capacity([build_robot(random_body(0, 4, 1), tank)], hinges=7, modules=15)
     assert pack_bodies([build_robot(body, tank) for body in bodies], capacity).count.max() <= 15
+    jet = MODULES["Thruster"]
+    three = tuple(replace(jet.parts[0], name=name) for name in "abc")
+    kinds = [replace(jet, parts=three), replace(jet, mount=None)]
+    assert fit_capacity(few, kinds, modules=4).thrusters == 1 + 3 * 3
 
 
 @pytest.fixture(scope="module")

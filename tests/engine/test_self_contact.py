@@ -306,8 +306,7 @@ def test_different_bodies_that_are_looked_at_all_at_once_feel_the_same(other_bac
     found = march_batch(robots, capacity, ctrl)
     np.testing.assert_allclose(found[0], usual[0], atol=5e-4)  # 20 µm at the end of 4 cm
     for k, robot in enumerate(robots):
-        own = found[:, : 7 + robot.num_hinges, 4 * k : 4 * k + 4]
-        assert depths(robot, own).max() < 3e-3
+        assert depths(robot, found[:, : 7 + robot.num_hinges, 4 * k : 4 * k + 4]).max() < 3e-3
 
 
 @pytest.mark.parametrize("seed", [23, 63, 77, 101, 166, 197])

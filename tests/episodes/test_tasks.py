@@ -12,6 +12,7 @@ from mjx_revolve.body.edits import add_module
 from mjx_revolve.engine.plant import body_geometry
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.config import TaskConfig
+from mjx_revolve.episodes.scoring import may_touch_bed
 from mjx_revolve.episodes.starts import draw_starts, episode_context, start_pose, target_path
 from mjx_revolve.episodes.tasks import RECORDS, TASKS, Task, start_on_bed
 from mjx_revolve.water.bed import bed_height
@@ -183,6 +184,10 @@ def test_what_starts_on_a_slope_starts_outside_it():
         place = jnp.array([x, 0.2, 0.0])
         lowest = start_on_bed(TaskConfig(type="crawl"), lake, figure, place)[2] - figure.lowest
         assert lowest > np.max(bed_height(lake.bed, x + around.real, 0.2 + around.imag))
+    # A start of one's own may be anywhere.
+    swim, given = TASKS["speed"], (TaskConfig(type="speed"), load_world("lake"), 0.1)
+    assert not may_touch_bed(swim, *given)
+    assert may_touch_bed(Task(lambda *_: 0.0, "m", start=start_on_bed), *given)
 
 
 def test_what_starts_on_the_bed_starts_level(settings):

@@ -190,8 +190,7 @@ def test_rewards_add_up_whatever_the_task_and_the_water(config, task):
         for i in range(2):
             own = actions[first : first + STEPS, i]
             trajectory, key = replay(fitness, own, env.environment.every, 5 + i, number)
-            score = fitness.judge(trajectory, key)[0]
-            assert total[i] == pytest.approx(score, rel=2e-3, abs=1e-4)
+            assert total[i] == pytest.approx(fitness.judge(trajectory, key)[0], rel=2e-3, abs=1e-4)
 
 
 @pytest.mark.slow

@@ -160,6 +160,11 @@ def test_a_copy_does_as_its_original():
     child = brains.inherit(np.random.default_rng(0), [parent, other], layout, origins)
     assert child["w fin_2"] == child["c knee_2~toe_2"] == -1
     assert child["w fin"] == parent["w fin"] and child["c knee~toe"] == parent["c knee~toe"]
+    # Of several joints of a copied module each is a copy.
+    two = layout._replace(names=["w two_2/a", "w two_2/b"], genes=layout.genes[:2])
+    parent = {"w two/a": 1.0, "w two/b": 2.0}
+    child = brains.inherit(np.random.default_rng(0), [parent], two, {"two_2": (0, "two")})
+    assert list(child.values()) == [1, 2]
 
 
 def test_the_network_by_hand():

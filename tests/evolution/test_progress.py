@@ -47,8 +47,7 @@ def test_a_log_has_sixty_lines_at_most(total, stride, clock):
         shown.show(row(generation))
     shown.close()
     told = [int(line.split("/")[0].split()[1]) for line in out.getvalue().splitlines()]
-    middle = range(stride, total + 1, stride)
-    assert told == sorted({0, 1, total, *middle})
+    assert told == sorted({0, 1, total, *range(stride, total + 1, stride)})
 
 
 def test_plain_lines_tell_the_time_left(clock):
@@ -92,8 +91,7 @@ def test_the_live_line_fits_its_terminal(columns, clock, monkeypatch):
     assert out.drawn[0].startswith("generation 0/4")
     assert len(out.drawn) == 5
     assert out.getvalue().endswith("\n")
-    found = re.sub("█+.", "bar", out.drawn[3]).strip()
-    assert re.split("  +", found) == LINES[size.columns]
+    assert re.split("  +", re.sub("█+.", "bar", out.drawn[3]).strip()) == LINES[size.columns]
 
 
 def test_dumb_terminals_get_plain_lines(clock, monkeypatch):

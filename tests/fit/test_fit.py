@@ -134,8 +134,7 @@ def test_numbers_of_one_thruster_and_of_one_ballast_act_together(auv):
             assert after.time_constant == pytest.approx(before.time_constant * np.exp(0.2))
             assert after.torque_ratio == before.torque_ratio != 0
     entries = entries_of(auv, parameters, offsets[order])
-    again = correct_modules(auv.morphology.modules, entries, "file")
-    assert again == robot.morphology.modules
+    assert correct_modules(auv.morphology.modules, entries, "file") == robot.morphology.modules
 
 
 def test_what_changes_nothing_is_refused(auv):

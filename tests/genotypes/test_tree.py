@@ -9,6 +9,7 @@ from mjx_revolve.body.catalogue import MODULES
 from mjx_revolve.body.morphology import load_morphology, make_morphology
 from mjx_revolve.genotypes.genotype import Space
 from mjx_revolve.genotypes.kinds import find_genotype
+from mjx_revolve.inputs.errors import InputError
 
 SPACE = Space(MODULES, ("FixedBrick", "ActiveHinge", "Fin"), "Core", 1, 12, 0, 8)
 RATES = ("add", "delete", "prune", "duplicate", "mirror", "swap", "retype", "turn")
@@ -72,7 +73,10 @@ def test_a_genotype_of_ones_own_may_be_this_one_and_its_copies_know_their_origin
     (tmp_path / "mine.py").write_text(
         "from mjx_revolve.genotypes.tree import make_tree\n"
         "def wrapped(space, params):\n    return make_tree(space, {}, 'mine')\n"
+        "def lost(*args):\n    return wrapped(*args)._replace(settle=lambda body: (body, [1]))\n"
     )
+    with pytest.raises(InputError, match="settle: expected"):
+        find_genotype(f"{tmp_path}/mine.py:lost", SPACE, {}, "test.yaml")
     settle = find_genotype(f"{tmp_path}/mine.py:wrapped", SPACE, {}, "test.yaml").settle
     assert settle(only("mirror")[0])[1]
 

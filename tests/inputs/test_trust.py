@@ -68,8 +68,7 @@ def test_nothing_of_a_strangers_is_run_unless_allowed(folder, name, capsys):
 
 def test_a_report_shows_the_rest(folder, capsys):
     assert run_command(report.main, ["run"]) == 0
-    err = capsys.readouterr().err
-    assert "expected a Python file that you have used before, or --trust" in err
+    assert "expected a Python file that you have used before, or --trust" in capsys.readouterr().err
     assert not (folder / "was run").exists()
     page = (folder / "run" / "report.html").read_text()
     assert "inputs/own.py" in page and "not shown in full" in page

@@ -223,8 +223,7 @@ def test_what_is_no_run_is_refused(tmp_path, make):
 
 
 def test_the_replay_scores_as_evolution_did(lab, copy):
-    replay = lab["replay"]
-    assert replay.score == lab["score"]
+    assert lab["replay"].score == lab["score"]
     record = read_run(copy)
     for name in ("run.json", "champion/genes.yaml"):
         data = (copy / name).read_text()
@@ -387,8 +386,7 @@ def test_a_champion_that_fails_its_passport_is_marked(copy, quick, capsys):
     assert run_command(inspect.main, [str(copy / "champion" / "morphology.yaml")]) == 0
     assert "champion of a run: fails its passport: kept_120_s" in capsys.readouterr().out
     path.write_text("checks: {a: 3}")
-    record = read_run(copy)
-    assert "checks.a: expected a mapping; found 3" in record.problems[0].text
+    assert "checks.a: expected a mapping; found 3" in read_run(copy).problems[0].text
 
 
 def test_the_command_prints_and_writes_a_passport(copy, monkeypatch, capsys):
@@ -401,8 +399,7 @@ def test_the_command_prints_and_writes_a_passport(copy, monkeypatch, capsys):
     monkeypatch.setattr("mjx_revolve.episodes.passport.make_passport", make)
     for value, code, said in ((0.4, 1, "FAILS"), (0.9, 0, "passes")):
         assert run_command(passport.main, [str(copy)]) == code
-        out = capsys.readouterr().out
-        assert f"share with drag x 1.3  {value}  at least 0.5  {said}" in out
+        assert f"share with drag x 1.3  {value}  at least 0.5  {said}" in capsys.readouterr().out
         found = load_passport(copy / "champion" / "passport.yaml")
         assert found.checks["drag"].value == value
     assert given[0] == (2, GENES.tolist(), 0)

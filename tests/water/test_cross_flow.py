@@ -85,8 +85,7 @@ def test_a_lone_rod_is_a_chain_that_sheds_nothing():
     assert across == pytest.approx(
         -0.5 * WATER.density * 1.75 * 0.1 * 0.5 * np.array([0, 0.3, 0.4])
     )
-    spun = spin(numbers, 2, 5.0)
-    assert spun == pytest.approx(-WATER.density * 1.75 * 0.1 / 64 * 25, rel=1e-4)
+    assert spin(numbers, 2, 5.0) == pytest.approx(-WATER.density * 1.75 * 0.1 / 64 * 25, rel=1e-4)
     assert shares_of(shorter.fluid) == pytest.approx([0.5])
 
 

@@ -37,8 +37,7 @@ def test_a_step_passes_the_lag_as_an_exponential(dt):
 
 
 def test_basic_thrust_goes_with_the_square_of_the_command():
-    found = thrust(BASIC, LANES)
-    assert found == pytest.approx(3 * np.sign(LANES) * LANES**2)
+    assert thrust(BASIC, LANES) == pytest.approx(3 * np.sign(LANES) * LANES**2)
 
 
 def test_dead_band_of_bessa():

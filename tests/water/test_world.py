@@ -294,8 +294,7 @@ def test_lake_extremes_are_exact():
     assert height.min() == height[499, 499] == pytest.approx(-112.8, abs=1e-5)
     assert height.max() == height[0, 0] == height[-1, -1] == pytest.approx(36.7, abs=1e-5)
     # A shore all round: nobody swims off the map.
-    rim = np.concatenate([height[0], height[-1], height[:, 0], height[:, -1]])
-    assert rim.min() > 20.0
+    assert np.concatenate([height[0], height[-1], height[:, 0], height[:, -1]]).min() > 20.0
 
 
 def test_lake_is_always_the_same_and_has_shore_slope_and_basin():
