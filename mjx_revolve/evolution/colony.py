@@ -13,6 +13,7 @@ and events (plain values for the log).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -24,7 +25,7 @@ from mjx_revolve.episodes.tank import TankTrajectory
 from mjx_revolve.evolution.body_fitness import BodyFitness
 from mjx_revolve.evolution.individuals import Individual
 from mjx_revolve.evolution.reproduction import make_child, make_founder, make_founders
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, note
 from mjx_revolve.water.bed import highest_bed
 
 # At birth, robots are further apart than the sum of their radii times this. A choice.
@@ -195,6 +196,8 @@ def make_rules(fitness: BodyFitness) -> Rules:
     window = 1 + max(1, round(colony.life.window / look))
     slots = fitness.config.evolution.population_size
     rules = Rules(colony, fitness, look, looks, window, slots, np.array(world.current, float))
+    if not math.isclose(rules.interval, colony.interval, rel_tol=1e-6):
+        note(f"colony.interval: {rules.interval:g} s, as colony.look is whole steps of {step:g} s")
     if world.bed is not None:
         bed = highest_bed(world.bed, colony.arena.size / 2)
         if rules.birth_height <= bed:

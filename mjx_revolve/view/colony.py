@@ -46,7 +46,7 @@ def record_colony(
     observed, _ = observe_colony(config, fitness, search, begin, duration, _GAP)
     if not observed:
         raise InputError(folder, f"robots alive from {begin:g} s on", "none")
-    # Poses are whole steps apart, which may be less than asked for; the first is one of them late.
+    # Poses are whole steps apart, perhaps less than `_GAP`; the first is that late.
     gaps = [float(one.time[1] - one.time[0]) for one in observed if len(one.time) > 1]
     start = min(float(one.time[0]) for one in observed) - min(gaps, default=_GAP)
     # A colony is advanced to the end of an interval.
