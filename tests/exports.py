@@ -83,8 +83,7 @@ def odd_episode() -> Episode:
         mujoco.mj_kinematics(robot.mj_model, data)
         rows.append((data.time, qpos, data.qvel.copy(), data.xpos.copy(), data.ctrl.copy(), 0.0))
     columns = [np.array(column, np.float32) for column in zip(*rows, strict=True)]
-    command = columns[4][:, list(robot.thrusters)]
-    return Episode("odd", robot, Trajectory(*columns, command))
+    return Episode("odd", robot, Trajectory(*columns, columns[4][:, list(robot.thrusters)]))
 
 
 @lru_cache

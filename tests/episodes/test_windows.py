@@ -79,8 +79,7 @@ def test_closed_loop_gradients_are_those_of_differences(whole, kind):
         episodes = windows.init(genes, KEY)
         gradients, _ = windows.step(genes, episodes)
         gradient = np.asarray(gradients.gradient).mean(1)[0]
-        value = mean_gain(windows, episodes, genes[1])
-        check_gradient(value, np.asarray(genes[0]), gradient)
+        check_gradient(mean_gain(windows, episodes, genes[1]), np.asarray(genes[0]), gradient)
 
 
 @pytest.fixture(scope="module")
@@ -125,8 +124,7 @@ def test_windows_carried_on_are_one_long_rollout(brain, windows):
             windows.step(genes, episodes)
         new = genes[::-1]
         gradient = np.asarray(windows.step(new, before)[0].gradient).mean(1)[0]
-        value = mean_gain(windows, before, new[1])
-        check_gradient(value, np.asarray(new[0]), gradient, 3)
+        check_gradient(mean_gain(windows, before, new[1]), np.asarray(new[0]), gradient, 3)
 
 
 @pytest.mark.slow

@@ -69,8 +69,7 @@ def signals(auv):
 
 @pytest.fixture(scope="module")
 def fitted(auv, signals):
-    recording = make_noisy(signals, rate=30, lost=0.05, seed=1, name="pool")
-    return fit_robot(auv, [recording], FREE)
+    return fit_robot(auv, [make_noisy(signals, rate=30, lost=0.05, seed=1, name="pool")], FREE)
 
 
 def test_what_is_simulated_for_a_fit_is_what_simulate_does(auv, signals):

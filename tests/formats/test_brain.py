@@ -108,8 +108,7 @@ def config(folder, kind, **settings):
 
 
 def genes_of(fitness, size=0.7):
-    draw = np.random.default_rng(3).normal(size=fitness.num_genes)
-    return (size * draw).astype(np.float32)
+    return (size * np.random.default_rng(3).normal(size=fitness.num_genes)).astype(np.float32)
 
 
 def record(fitness, genes):
@@ -446,8 +445,7 @@ class _Node:
         self.timers.append((period, callback))
 
     def get_clock(self):
-        stamp = types.SimpleNamespace(to_msg=lambda: "now")
-        return types.SimpleNamespace(now=lambda: stamp)
+        return types.SimpleNamespace(now=lambda: types.SimpleNamespace(to_msg=lambda: "now"))
 
 
 class _Message:

@@ -90,8 +90,7 @@ def test_the_same_innovation_has_the_same_number():
     """Strangers who put a node into the same link can be aligned; without numbers they cannot."""
 
     def split(seed, settings):
-        rng = np.random.default_rng(seed)
-        return draw_cppn(rng, 1, 1, settings).nodes[0].number
+        return draw_cppn(np.random.default_rng(seed), 1, 1, settings).nodes[0].number
 
     assert len({split(seed, CPPNSettings(first_nodes=1)) for seed in range(5)}) == 1
     foreign = CPPNSettings(first_nodes=1, innovations=False)

@@ -112,6 +112,14 @@ def test_a_folder_without_rights_takes_no_lock(caches, monkeypatch):
         pass
 
 
+def test_a_users_flags_of_xla_stay(monkeypatch):
+    for given in ("--xla_dump_to=here", "--xla_backend_extra_options=-inline-threshold=9"):
+        monkeypatch.setenv("XLA_FLAGS", given)
+        runtime.fix_environment()
+        assert runtime.user_flags() == given
+        assert ("unroll" in os.environ["XLA_FLAGS"]) == ("dump" in given)
+
+
 def test_random_numbers_of_another_kind_are_another_program(caches):
     def fun(key):
         return jax.random.normal(key, (3,))

@@ -28,8 +28,7 @@ def chain_numbers(end=0.0, water=WATER):
         ends=np.array([[end, 0.0, 0.0]]), rows=np.array([[2.0, 0.1, 0.06]]),
         coefficients={"drag_coefficient": np.full((1, 3), 1.05), "friction": np.array([0.455])},
     )  # fmt: skip
-    numbers = CROSS_FLOW.numbers(parts, water)
-    return as_components(jax.tree.map(lambda x: x[0], numbers))
+    return as_components(jax.tree.map(lambda x: x[0], CROSS_FLOW.numbers(parts, water)))
 
 
 @pytest.fixture(scope="module")
