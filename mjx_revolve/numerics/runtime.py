@@ -32,7 +32,7 @@ except ImportError:  # not on Windows: there, each process compiles
 _THREAD_SETTINGS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 # LLVM unrolls loops of up to some twenty passes before it looks for vectors, and then finds none.
 # Robots that touch themselves are computed by fours: with loops kept, 256 random bodies step a
-# fifth faster, and programs compile in a tenth less time; the bits are the same.
+# fifth faster, and programs compile in a tenth less time. Some programs have other last bits.
 _LLVM = "--xla_backend_extra_options=-unroll-full-max-count=1"
 _PACKAGES = (
     "mjx_revolve", "jax", "jaxlib", "mujoco", "mujoco-mjx", "evosax", "numpy", "scipy",
@@ -54,13 +54,17 @@ _xla_cores: int | None = None
 _programs: Path | None = None
 
 
+def _fix_threads() -> None:
+    for name in _THREAD_SETTINGS:
+        os.environ.setdefault(name, "1")
+
+
 def fix_environment() -> None:
     """Fixes what NumPy reads when it is imported, and XLA when it starts: threads, LLVM's options.
 
     Options that a user gives LLVM take the place of ours.
     """
-    for name in _THREAD_SETTINGS:
-        os.environ.setdefault(name, "1")
+    _fix_threads()
     flags = os.environ.get("XLA_FLAGS", "")
     if expects_cpu() and "xla_backend_extra_options" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {_LLVM}".strip()
@@ -145,7 +149,7 @@ def prepare_worker(core: int | None, cache: str | None) -> None:
         cache: the compilation cache's folder that the main process uses. The main process has
             removed broken entries; the worker does not, as an entry may be in writing.
     """
-    fix_environment()
+    _fix_threads()  # XLA's flags are those of the process that the worker works for
     os.environ["JAX_PLATFORMS"] = "cpu"
     _use_cache(Path(cache) if cache else None, _WORKER_MIN_COMPILE_TIME)
     if core is not None:
