@@ -70,9 +70,9 @@ def fix_environment() -> None:
         os.environ["XLA_FLAGS"] = f"{flags} {_LLVM}".strip()
 
 
-def user_flags() -> str | None:
-    """XLA's flags in the environment, without that of `fix_environment`."""
-    return os.environ.get("XLA_FLAGS", "").replace(_LLVM, "").strip() or None
+def user_flags(flags: str) -> str:
+    """Flags of XLA without that of `fix_environment`."""
+    return flags.replace(_LLVM, "").strip()
 
 
 @contextlib.contextmanager
@@ -363,7 +363,7 @@ def describe_process() -> dict[str, object]:
         "cpu_count": usable_cores(),
         "device": jax.devices()[0].device_kind,
         "threads": {name: os.environ.get(name) for name in (*_THREAD_SETTINGS, "NPROC")},
-        "xla_flags": user_flags(),
+        "xla_flags": os.environ.get("XLA_FLAGS"),
     }
 
 

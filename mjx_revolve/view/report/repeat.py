@@ -7,6 +7,7 @@ from pathlib import Path
 
 import yaml
 
+from mjx_revolve.numerics import runtime
 from mjx_revolve.view.report.record import RunRecord
 
 # Set to 1 by the command itself where the environment does not set them.
@@ -24,8 +25,8 @@ def repeat_command(record: RunRecord) -> str:
     values = {name: threads.get(name) for name in _THREADS} if isinstance(threads, dict) else {}
     before = [f"{name}={shlex.quote(value)}" for name, value in values.items()
               if isinstance(value, str) and value != "1"]  # fmt: skip
-    if isinstance(flags, str) and flags:
-        before.append(f"XLA_FLAGS={shlex.quote(flags)}")
+    if isinstance(flags, str) and (given := runtime.user_flags(flags)):
+        before.append(f"XLA_FLAGS={shlex.quote(given)}")
     place = record.path
     words = ["python", "-m", "mjx_revolve.evolve", f"{place}/config.yaml"]
     return " ".join([*before, shlex.join([*words, "--out", f"{place}-again"])])
