@@ -219,7 +219,7 @@ def test_finite_everywhere(plate, dtype):
     for x in (value, *slopes):
         assert np.all(np.isfinite(x))
     bound = 20 * RHO * AREA * np.square(beside).sum(0) + 1e-30
-    assert np.all(np.abs(value[:, :3]).T <= bound)
+    assert (np.abs(value[:, :3]).T / bound).max() <= 1
     assert np.abs(value[0]).max() == 0  # at rest
     if plate != "round":
         assert np.abs(value[2, :6]).max() == 0  # along the span
