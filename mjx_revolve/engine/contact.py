@@ -82,6 +82,7 @@ def bed_contact(
     point_mass: Scalar,
     timestep: float,
     fall: Scalar = 0.0,
+    felt: bool = False,
 ) -> tuple[Vec, Scalar, Scalar]:
     """Force of the bed on points of the robot, and the damping of its implicit part.
 
@@ -106,6 +107,7 @@ def bed_contact(
         point_mass: m, each point's share of its body's mass [kg]; 0 for padding.
         timestep: dt [s].
         fall: acceleration at which the point would begin to sink [m/s²], `Points.fall`.
+        felt: whether the force is that on sensors: of F_n, what friction takes.
 
     Returns:
         Force on each point, same frame [N], and its damping along the normal and across it [N·s/m].
@@ -129,12 +131,18 @@ def bed_contact(
     arrest = mul(point_mass / timestep, jnp.maximum(neg(outward), 0))
     borne = jnp.minimum(push, add(mul(stiffness, jnp.maximum(depth, 0)), arrest))
     grip = bed.friction * borne / jnp.sqrt(dot(sliding, sliding) + CREEP_SPEED**2)
-    force = tuple(push * n - grip * s for n, s in zip(normal, sliding, strict=True))
+    along = borne if felt else push
+    force = tuple(along * n - grip * s for n, s in zip(normal, sliding, strict=True))
     return force, resistance, grip
 
 
 def bed_forces(
-    world: World, level: Level, motion: BodyMotion, points: Points, water: Water
+    world: World,
+    level: Level,
+    motion: BodyMotion,
+    points: Points,
+    water: Water,
+    felt: bool = False,
 ) -> tuple[Vec, Vec, SpatialInertia]:
     """What the bed does to the bodies of a level.
 
@@ -144,12 +152,13 @@ def bed_forces(
         motion: where they are and how they move, relative to the uniform current.
         points: of them that may touch.
         water: its uniform current is how fast the bed passes by.
+        felt: as in `bed_contact`.
 
     Returns:
         Torque [N·m] and force [N] about each body's origin, body frame, and their damping.
     """
     k = points.count
-    force, stiff, grip, normal, wide = _at_points(world, level, motion, points, water)
+    force, stiff, grip, normal, wide = _at_points(world, level, motion, points, water, felt)
     torque = cross(points.position, force)
 
     def gather(x: Scalar) -> Scalar:
@@ -178,12 +187,12 @@ def bed_normal_force(
     Returns:
         `[npoint, nbody, lanes]` [N]; friction apart.
     """
-    force, _, _, normal, wide = _at_points(world, level, motion, points, water)
+    force, _, _, normal, wide = _at_points(world, level, motion, points, water, True)
     return dot(force, tuple(wide(x) for x in normal))
 
 
 def _at_points(
-    world: World, level: Level, motion: BodyMotion, points: Points, water: Water
+    world: World, level: Level, motion: BodyMotion, points: Points, water: Water, felt: bool
 ) -> tuple[Vec, Scalar, Scalar, Vec, Callable[[Scalar], jax.Array]]:
     """Force on each point with its damping, the bed's normal, and what widens to all points."""
     k, n, lanes = points.count, level.count, jnp.shape(motion.height)[-1]
@@ -205,7 +214,7 @@ def _at_points(
     dry = motion.height > water.surface_height
     fall = jnp.where(dry, cast(world.gravity, motion.height), cast(points.fall, motion.height))
     force, stiff, grip = bed_contact(
-        world.bed, depth, wide_normal, velocity, points.mass, world.timestep, fall
+        world.bed, depth, wide_normal, velocity, points.mass, world.timestep, fall, felt
     )
     return force, stiff, grip, normal, wide
 

@@ -28,7 +28,7 @@ from mjx_revolve.engine.self_contact import (
     Robots,
     contact_acceleration,
 )
-from mjx_revolve.engine.servos import end_stop, servo, spring_damping
+from mjx_revolve.engine.servos import end_stop, own_torque, servo, spring_damping
 from mjx_revolve.engine.state import State, effective_gravity, has_acceleration
 from mjx_revolve.engine.tree import Tree
 from mjx_revolve.numerics.articulated import (
@@ -162,7 +162,8 @@ def accelerate(
         block, bias = to_parent(rotation, level.hinges.position, block, bias, symmetric)
         # Of a symmetric block it is the row of `joint`.
         saved = joint, tree.unstack_parts(submerged), column if meets and not symmetric else ()
-        return _flatten(block, bias, symmetric), saved, jnp.abs(motor * speed)
+        spent = jnp.abs(own_torque(level.hinges, motor) * speed)
+        return _flatten(block, bias, symmetric), saved, spent
 
     children, saved, power = tree.backward_pass(
         articulate,

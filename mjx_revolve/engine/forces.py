@@ -103,7 +103,7 @@ def external_force(tree: Tree, state: State, water: Water, thrusts: Any) -> tupl
         external = water_forces(world, level, motion, gravity, water, thrusts, before)
         bed: Vec = ZERO
         if level.points is not None:
-            bed = bed_forces(world, level, motion, level.points, still)[1]
+            bed = bed_forces(world, level, motion, level.points, still, True)[1]
         wide = lambda x: add(x, jnp.zeros_like(motion.height))  # noqa: E731
         turned = tuple(
             tuple(wide(dot(axis, force)) for axis in motion.axes) for force in (bed, external.force)
@@ -144,7 +144,8 @@ def contact_force(
         push = given.pop(0)[1] if wrench else ZERO
         press = add(given.pop() if given else 0.0, children[3] if children else 0.0)
         if level.points is not None:
-            push = vadd(push, bed_forces(tree.world, level, moved[0], level.points, still)[1])
+            bed = bed_forces(tree.world, level, moved[0], level.points, still, True)
+            push = vadd(push, bed[1])
         push = vadd(push, children[:3]) if children else push
         force = safe_norm(tuple(add(x, size) for x in push)) + press
         # An overflow row of `BatchedTrees` is part of the body that it is fixed to.

@@ -153,7 +153,7 @@ def _stream(world: World, water: Water, motion: BodyMotion, position: Vec) -> _S
     point = _world_position(motion, position)
     velocity, acceleration = flow(world, rest, *point)
     if world.waves:
-        acceleration = vadd(acceleration, wave_convection(world, rest, *point))
+        acceleration = vadd(acceleration, wave_convection(world, water, *point))
     return _Stream(_to_body(motion, _some(velocity)), _to_body(motion, _some(acceleration)))
 
 

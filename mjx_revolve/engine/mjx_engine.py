@@ -25,7 +25,7 @@ from mjx_revolve.engine.hydrodynamics import PreviousStep
 from mjx_revolve.engine.kinematics import body_motions, center_of_mass
 from mjx_revolve.engine.plant import Plant, plant_of
 from mjx_revolve.engine.robot import Robot, check_timestep, import_mjx
-from mjx_revolve.engine.servos import end_stop, servo, spring_damping
+from mjx_revolve.engine.servos import end_stop, own_torque, servo, spring_damping
 from mjx_revolve.engine.single_tree import SingleTree, make_single_tree
 from mjx_revolve.engine.state import RootState, State, integrate_quat
 from mjx_revolve.engine.thrusters import run_thrusters
@@ -485,7 +485,7 @@ def _add_servos(
     stop, stop_inertia = end_stop(hinges, angle, speed, plan.dt, gain)
     implicit, torque = (inertia + stop_inertia)[:, 0], (motor + stop)[:, 0]
     found = _Matrices(mass.at[v, v].add(implicit), force.at[v].add(torque))
-    return found, jnp.sum(jnp.abs(motor * speed))
+    return found, jnp.sum(jnp.abs(own_torque(hinges, motor) * speed))
 
 
 def _advance(plan: MjxEngine, flow: _Flow, rates: Any, current: Any) -> tuple[Any, Any, Any]:

@@ -123,8 +123,11 @@ def motor_torque(
     Returns:
         The torque [N·m].
     """
-    torque, _ = servo(hinges, angle, speed, target, dt, 1.0, 0.0, damped)
-    # Beyond the top speed that torque brakes; a motor has no more than its effort.
+    return own_torque(hinges, servo(hinges, angle, speed, target, dt, 1.0, 0.0, damped)[0])
+
+
+def own_torque(hinges: Hinges, torque: Scalar) -> Scalar:
+    """That of the motors: `servo`'s brakes beyond the top speed, with more than their effort."""
     return jnp.clip(torque, *(cast(x, torque) for x in hinges.effort))
 
 

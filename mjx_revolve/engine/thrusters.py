@@ -112,7 +112,8 @@ def run_thrusters(
 
     Returns:
         The lagged commands after the step, the thrusts, `[nthruster, lanes]` [N], and the power
-        that ideal propellers need for them, `[nthruster, lanes]` [W] (`ideal_power`).
+        that ideal propellers need for them, `[nthruster, lanes]` [W] (`ideal_power`). Above the
+        surface, where they push nothing, they are taken to need as much.
     """
     known = partial(cast, like=ctrl)
     clipped = jnp.clip(ctrl, known(thrusters.low), known(thrusters.high))

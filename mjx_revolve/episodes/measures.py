@@ -43,7 +43,7 @@ def measure(track: Track, names: Iterable[str] = ()) -> dict[str, jax.Array]:
           over time, so over ground, `speed_bl_s` in body lengths;
         - `path_length_m` length of its path, `path_speed_m_s` the same over time;
         - `straightness` displacement over path length;
-        - `energy_j` work of the servos, summed without sign;
+        - `energy_j` work of servos and ideal propellers, summed without sign;
         - `cost_of_transport` energy over weight in air times displacement;
         - `depth_m` its mean depth, `depth_error_m` root mean square distance from the
           start's depth.

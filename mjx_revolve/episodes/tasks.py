@@ -49,7 +49,7 @@ class Track:
         position: `[S, 3, lanes]` the robot's place, its `task.point` (the centre of mass, or the
             core), world frame [m]; the first row is where counting starts.
         clearance: `[S, lanes]` height of that point above the bed, infinite without one [m].
-        energy: `[S, lanes]` work of the servos since the row before, summed without sign [J].
+        energy: `[S, lanes]` work of servos and propellers since the row before, without sign [J].
         interval: time between rows [s].
         start_height: height of that point at the episode's start, world frame [m].
         length: body length, stretched out or at rest as `task.length` says [m].

@@ -14,7 +14,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_revolve.numerics.spatial import Scalar, Vec, add, mul, sincos, sub, symvec, vadd, vscale
+from mjx_revolve.numerics.spatial import (
+    Scalar,
+    Vec,
+    add,
+    mul,
+    sincos,
+    sub,
+    symvec,
+    vadd,
+    vscale,
+    vsub,
+)
 from mjx_revolve.water.currents import CurrentField, Gust, Shear, Wave
 from mjx_revolve.water.world import World
 
@@ -289,7 +300,10 @@ def _fading(world: World, wave: Wave, water: Water, z: Scalar) -> tuple[Scalar, 
 
 
 def wave_convection(world: World, water: Water, x: Scalar, y: Scalar, z: Scalar) -> Vec:
-    """u·∇u of the waves' orbital velocity: what water accelerates by because it moves on.
+    """u·∇ of the waves' orbital velocity: what water accelerates by because it moves on.
+
+    u is all that moves the water but the world's current, which carries the waves: `wave_flow`
+    has what follows from that.
 
     Above the still surface it is the value at the still surface.
     Of second order in the waves' steepness, like the drift that it keeps away: without it a neutral
@@ -305,10 +319,10 @@ def wave_convection(world: World, water: Water, x: Scalar, y: Scalar, z: Scalar)
     Returns:
         Acceleration [m/s²], world frame.
     """
-    velocity: Vec = (0.0, 0.0, 0.0)
+    rest = water._replace(current=vsub(water.current, world.current))
+    velocity, _ = flow(world, rest, x, y, z)
     gradient: list[Scalar] = [0.0] * 6  # ∇u is symmetric, as u has a potential: xx xy xz yy yz zz
     for wave in _running(world):
-        velocity = vadd(velocity, wave_flow(world, wave, water, x, y, z)[0])
         (c, s), omega = _towards(wave), wave.frequency(world.gravity, world.water_depth)
         sine, cosine = _phase(world, wave, water, x, y)
         along, upright = _fading(world, wave, water, z)

@@ -7,9 +7,11 @@ import pytest
 
 from laboratory import WATER, body, box_robot, march, random_states, world
 from mjx_revolve.engine.contact import bed_contact, bed_plane
+from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.episodes.simulate import simulate
 from mjx_revolve.water.bed import Bed, bed_height, bed_slope
+from mjx_revolve.water.flow import water_of
 from mjx_revolve.water.world import load_world
 from references import Lagrangian, clearance, each_lane
 
@@ -136,6 +138,24 @@ def test_a_core_lands_on_a_flat_bed_and_stays():
         assert max(energy) < start
         # What rises is what the ground had stored.
         assert np.diff(energy).max() < 0.05 * (start - energy[-1])
+
+
+@pytest.mark.parametrize("dt", [0.0025, 0.01])
+def test_the_force_that_is_felt_is_the_one_that_stops_a_fall(dt):
+    """Its impulse is the change of momentum, and the weight's."""
+    robot = build_robot(body("core"), world(gravity=G, bed=Bed(height=-1.0), timestep=dt))
+    engine, still, weight = make_engine(robot), water_of(robot.world), G * robot.morphology.mass
+    qpos = np.array(robot.mj_model.qpos0)[:, None]
+    qpos[2] = -0.95
+
+    def step(state, _):
+        state, _ = engine.step(state, jnp.zeros((0, 1)), still)
+        return state, (engine.contact_force(state, still)[0, 0], engine.root(state).velocity[2])
+
+    start = engine.init(jnp.asarray(qpos), jnp.zeros((6, 1)))
+    _, (force, rise) = jax.lax.scan(step, start, length=round(0.4 / dt))
+    assert rise.min() < -0.6 and abs(rise[-1]) < 1e-4
+    assert dt * force.sum() == pytest.approx(0.4 * weight, rel=0.1)
 
 
 def test_creep_stays_below_the_stated_speed():
