@@ -10,7 +10,6 @@ It writes a folder with `coefficients.yaml`, which morphologies and configuratio
 from __future__ import annotations
 
 import argparse
-import datetime
 import shlex
 import sys
 from pathlib import Path
@@ -143,8 +142,8 @@ def _fit(arguments: argparse.Namespace, interrupts: Interrupts) -> int:
         for recording in recordings:
             for note in recording.notes:
                 print(plain(f"note: {recording.name}: {note}"))
-        out = Path(arguments.out or f"runs/fit-{datetime.datetime.now():%Y%m%d-%H%M%S}")
-        check_place(out / "any", f"--out {out}")
+        out = arguments.out
+        check_place(Path(out or "runs/any") / "any", f"--out {out}" if out else "runs")
         free = tuple(_free(arguments.free))
         request = Request(robot, recordings, free, settings, arguments.seed, (entry, copies))
         run = FitRun.begin(out, request)

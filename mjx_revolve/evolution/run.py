@@ -42,6 +42,7 @@ from mjx_revolve.evolution.tensorboard import TensorBoardLog, check_tensorboard
 from mjx_revolve.inputs.commands import check_place
 from mjx_revolve.inputs.errors import InputError, reading, show
 from mjx_revolve.inputs.files import naming
+from mjx_revolve.inputs.overrides import merge_override, read_overrides
 from mjx_revolve.inputs.shipped import find_shipped
 from mjx_revolve.inputs.user_code import announce
 from mjx_revolve.numerics import runtime
@@ -145,7 +146,7 @@ class Run:
             **runtime.describe_process(),
         }
         with writing or contextlib.nullcontext():
-            folder, config = create_run_folder(out or _claim_folder(config), config, **info)
+            folder, config = create_run_folder(out or claim_folder(config.name), config, **info)
         return cls(folder, config, executor, make_evolution(config, executor))
 
     @classmethod
@@ -425,13 +426,18 @@ def _prepare(config: Config, make_executor: MakeExecutor) -> Executor:
         if file.kind == "code":
             announce(file.text)
     executor = make_executor(config)
+    check_genes(config, executor)
+    return executor
+
+
+def check_genes(config: Config, executor: Executor) -> None:
+    """Refuses a robot that has none, and populations that do not fit into memory; InputError."""
     fitness = executor.fitness
     if isinstance(fitness, Fitness) and not fitness.engine.plant.num_actuators:
         robot = "a robot with hinges or thrusters, as its controller is to evolve"
         found = f"none in {show(fitness.robot.morphology.name)}"
         raise InputError(f"{config.source}: morphology", robot, found)
     check_memory(config, executor.num_genes)
-    return executor
 
 
 def check_search(config: Config, executor: Executor) -> None:
@@ -496,10 +502,15 @@ def _portable(settings: Sequence[str], config: Config) -> list[str]:
     texts |= {"world": world, "world.name": world} if world else {}
     portable = []
     for setting in settings:
-        key, _, value = setting.partition("=")
-        text = None if value.lstrip().startswith(("{", "[")) else texts.get(key.strip())
+        ((key, value),) = read_overrides([setting])[0].items()
+        given: dict[str, Any] = {}
+        merge_override(given, key, value, "--set")
+        found: Any = map_files(given, lambda file: texts.get(file.place, file.text), Config)
+        for step in key.split("."):
+            given, found = given[step], found[step]
         # As YAML: a folder's name may hold ` #` or `: `.
-        portable.append(f"{key}={json.dumps(text, ensure_ascii=False)}" if text else setting)
+        text = json.dumps(found, ensure_ascii=False) if found != given else None
+        portable.append(f"{key}={text}" if text else setting)
     return portable
 
 
@@ -514,9 +525,9 @@ def timestamp() -> str:
     return datetime.datetime.now().astimezone().isoformat(timespec="seconds")
 
 
-def _claim_folder(config: Config) -> Path:
+def claim_folder(name: str) -> Path:
     """A new folder below `runs/`, unique even if other runs begin at the same time."""
-    stem = f"{config.name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    stem = f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
     names = itertools.chain([stem], (f"{stem}-{n}" for n in itertools.count(2)))
     while True:
         folder = _RUNS / next(names)

@@ -211,6 +211,10 @@ def _plain_value(
             start = max(jet.time_constant for jet in jets.values()) or _USUAL_LAG
             lag = lambda v: {m: {"thruster": {field: v}} for m in jets}  # noqa: E731
             return Parameter(text, "s", start, math.log(_THRUSTER[field]), True, lag)
+        for module in jets:  # params of a module are of all of its thrusters
+            parts = (part.thruster for part in kinds[module].parts)
+            if len({getattr(jet, field) for jet in parts if jet is not None}) > 1:
+                raise InputError(f"--free {text}", f"thrusters alike in {module}", "several")
 
         def scaled(value: float) -> dict[str, Any]:
             thrust = "thrust" if field.startswith("gain") else ""

@@ -630,6 +630,9 @@ class _View:
             self.quat = Rotation.from_euler("ZYX", np.stack(turns, -1)).as_quat(scalar_first=True)
             read = signals["yaw"].time
             none = ~np.isin(self.time, read) if "x" in signals else gap(read, self.time)
+            for name in ("pitch", "roll"):
+                if name in signals:  # between its rows, but not in a gap nor beyond its ends
+                    none |= gap(signals[name].time, self.time)
             self.quat[none] = np.nan
             self.level = "roll" not in signals
         if self.quat is not None and not np.isfinite(self.quat).all(1).any():
@@ -677,7 +680,12 @@ class _View:
             else:  # from above, the attitude alone says roll and pitch
                 self.quat = np.where(np.isfinite(self.quat), self.quat, turned)
         else:
-            self.position = self.seen[:, 0]
+            self.position = self.seen[:, 0].copy()
+            if self.quat is not None:  # else nothing says on which side of the core it is
+                known = np.isfinite(self.quat).all(1)
+                turn = Rotation.from_quat(self.quat[known], scalar_first=True)
+                self.position[known] -= turn.apply(model[known, 0])
+                self.position[~known] = np.nan
         if self.planar:
             self.position[:, 2] = np.nan
 

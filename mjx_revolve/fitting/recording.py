@@ -185,6 +185,9 @@ def check_recording(recording: RobotRecording, robot: Robot) -> None:
                 raise InputError(name, "[n] times and values", " and ".join(map(str, shapes)))
             if not (np.isfinite(signal.time).all() and (np.diff(signal.time) > 0).all()):
                 raise InputError(f"{name}: time", "rising times", "others")
+        seen = {name.split(".")[1] for name in recording.signals if name.startswith("mark.")}
+        if lacking := sorted(seen.symmetric_difference(recording.marks)):
+            raise InputError(f"mark {lacking[0]}", "one of `marks`, with signals", "one of the two")
         _check_signals(recording.signals, robot)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -236,9 +237,12 @@ def conclude(
         if np.isfinite(problem.fitted_until[r])
     )
     advice = ""
+    plan = None
     if advise:
         own, _ = split_free(free)
-        plan = plan_motions(problem.robot, own, problem.settings, found.information, 1)
+        with contextlib.suppress(InputError):  # a motion that diverges: no advice, but the fit
+            plan = plan_motions(problem.robot, own, problem.settings, found.information, 1)
+    if plan is not None:
         spread = np.array([p.spread for p in problem.parameters])
         now = np.sqrt(np.diag(found.covariance)) / spread
         worst = int(np.argmax(now))

@@ -18,7 +18,7 @@ from mjx_revolve.body.morphology import load_morphology, save_morphology, trim_n
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.evolution.interrupts import Interrupts
 from mjx_revolve.evolution.progress import Progress
-from mjx_revolve.evolution.run import timestamp
+from mjx_revolve.evolution.run import claim_folder, timestamp
 from mjx_revolve.evolution.run_folder import RunFolder, begin_run_folder, open_run_folder
 from mjx_revolve.fitting.estimate import FitState, Model, advance, begin, linearize
 from mjx_revolve.fitting.problem import FitProblem, FitSettings, Point, make_problem
@@ -174,8 +174,8 @@ class FitRun:
     model: Model | None = None
 
     @classmethod
-    def begin(cls, out: str | Path, request: Request) -> FitRun:
-        """Begins one in a new folder.
+    def begin(cls, out: str | Path | None, request: Request) -> FitRun:
+        """Begins one in a new folder; None: one below `runs/`, named after the time.
 
         Raises:
             InputError: the folder holds something, or the recordings do not suit the robot.
@@ -190,7 +190,7 @@ class FitRun:
         files = {f"inputs/{name}": content for name, content in copies.items()}
         files["inputs/recordings.npz"] = _pack(request.recordings)
         folder = begin_run_folder(
-            out, files,
+            out or claim_folder("fit"), files,
             kind="fit", started=timestamp(), seed=request.seed, **runtime.describe_process(),
         )  # fmt: skip
         save_morphology(request.robot.morphology, folder.path / "inputs" / "robot.yaml")

@@ -227,6 +227,8 @@ def test_an_attitude_beside_one_mark_counts(auv):
         assert [c.kind for c in problem.channels] == ["marks", "attitude"]
         yaw = Rotation.from_quat(problem.roots[:, 3:7, 0], scalar_first=True).as_rotvec()[:, 2]
         assert yaw == pytest.approx(0.3, abs=1e-6)
+        # The core is beside the mark.
+        assert problem.roots[:, 1, 0] == pytest.approx(-0.1 * np.cos(0.3), abs=1e-6)
 
 
 def test_what_is_held_out_is_foretold_better_than_before(fitted):
@@ -515,13 +517,15 @@ def test_marks_may_be_seen_one_at_a_time(auv, tmp_path):
         make_problem(auv, [recording], ["drag"], FitSettings())
 
 
-def test_a_gap_of_the_heading_is_none_of_it(auv):
+@pytest.mark.parametrize("angle", ["yaw", "roll"])
+def test_a_gap_of_the_attitude_is_none_of_it(auv, angle):
     """Nothing is interpolated in it, and no window begins there."""
     time = np.sort(np.r_[np.arange(150) / 15, np.arange(150) / 15 + 0.001])  # in bursts of two
     lost = (time > 2) & (time < 6)
     given = {"x": 0.2 * time, "y": 0 * time, "z": 0 * time - 1}
     given = {n: TimeSeries(time, x) for n, x in given.items()}
-    given["yaw"] = TimeSeries(time[~lost], 0.1 * time[~lost])
+    cut = TimeSeries(time[~lost], 0.1 * time[~lost])
+    given |= {"yaw": TimeSeries(time, 0.1 * time), angle: cut}
     settings = FitSettings(window=1.0, held_out=0.0)
     problem = make_problem(auv, [RobotRecording("swim", given)], ["drag"], settings)
     begun = problem.begin[0] + problem.piece * np.flatnonzero(problem.drive.resets[:, 0])
