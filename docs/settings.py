@@ -21,8 +21,8 @@ from pydantic_core import PydanticUndefined
 from mjx_revolve import schema
 from mjx_revolve.control.table import CONTROLLERS
 from mjx_revolve.episodes import config as settings
+from mjx_revolve.episodes.strategy_names import STRATEGY_NAMES
 from mjx_revolve.episodes.tasks import TASKS
-from mjx_revolve.evolution.strategies import STRATEGIES
 from mjx_revolve.inputs.validation_messages import describe, fields_of
 from mjx_revolve.water.bed import Bed
 from mjx_revolve.water.buoyancy import BUOYANCY_LAWS
@@ -167,7 +167,7 @@ def make_page() -> str:
     for name, kind in sections(settings.Config):
         lines += [f"### `{name}`: {first_paragraph(kind)}", ""]
         lines += table(kind, f"{name}.")
-    strategies = ", ".join(f"`{name}`" for name in STRATEGIES)
+    strategies = ", ".join(f"`{name}`" for name in STRATEGY_NAMES)
     where = "`evolution.strategy` and `bodies.learning.strategy`"
     lines += ["### Strategies", "", f"{where}, by evosax's names: {strategies}."]
     lines += ["", "## A world", "", "`docs/physics.md` has the laws.", ""]

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import shlex
 import sys
 from collections.abc import Callable
@@ -33,6 +32,7 @@ from mjx_revolve.inputs.commands import (
     read_path,
     read_seed,
     run_command,
+    say,
 )
 from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.files import short_path
@@ -153,7 +153,7 @@ def _start(
         raise InputError(f"--resume {folder}", "no --out beside it", arguments.out)
     trust = arguments.trust
     config = _check(arguments, files=make_fitness is None)
-    _say(plain(f"loading {folder or path}"))  # it takes seconds
+    say(plain(f"loading {folder or path}"))  # it takes seconds
     count = 1
     if make_fitness is None and not arguments.cluster and runtime.expects_cpu():
         from mjx_revolve.evolution.executor import choose_workers
@@ -187,11 +187,13 @@ def _check(arguments: argparse.Namespace, files: bool) -> Config:
     path, folder = arguments.config, arguments.resume
     from mjx_revolve.episodes.config import load_config
     from mjx_revolve.episodes.named_files import check_files
+    from mjx_revolve.episodes.strategy_names import check_strategies
     from mjx_revolve.evolution.run_folder import check_new_folder, check_run_folder
 
     if folder is None:
         with opening_config(path, arguments.trust):
             config = load_config(path, arguments.settings)
+            check_strategies(config)
             if files:
                 check_files(config)
             if arguments.out is not None:
@@ -209,36 +211,28 @@ def _evolve(run: Run, interrupts: Interrupts) -> int:
     """Evolves a run with checked arguments."""
     config, place = run.config, short_path(run.folder.path)
     if run.is_finished:
-        _say(
+        say(
             f"{place}: finished after {run.generation} {run.unit}s; to go on: "
             f"--set evolution.generations={2 * run.generation}"
         )
         return 0
-    _say(plain(_describe(run)))
+    say(plain(_describe(run)))
     if run.resumed:
-        _say(f"resuming {run.resumption}")
+        say(f"resuming {run.resumption}")
     interrupts.finish_first("finishing what is under way")
     champion = run.evolve(interrupts, _save_pictures)
     if champion is None:
         saved = f"stopped after {run.unit} {run.generation}; all of it is saved"
-        _say(f"{saved}\n{_resume_hint(run)}")
+        say(f"{saved}\n{_resume_hint(run)}")
         return interrupts.exit_code
     from mjx_revolve.view.results import describe_score
 
-    _say(f"champion: {describe_score(champion, config)} ({champion.origin})")
+    say(f"champion: {describe_score(champion, config)} ({champion.origin})")
     if champion.measures:
         figures = (f"{name} {value:.3g}" for name, value in champion.measures.items())
-        _say(f"measures: {', '.join(figures)}")
-    _say(f"run folder: {place}")
+        say(f"measures: {', '.join(figures)}")
+    say(f"run folder: {place}")
     return 0
-
-
-def _say(text: str) -> None:
-    """A line on standard output; if nothing reads it any more, the run goes on in silence."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _save_pictures(run: Run, champion: Champion) -> None:

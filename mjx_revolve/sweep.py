@@ -24,6 +24,7 @@ from mjx_revolve.inputs.commands import (
     program_again,
     read_path,
     run_command,
+    say,
     whole,
 )
 from mjx_revolve.inputs.errors import InputError, plain
@@ -112,23 +113,24 @@ def main(argv: list[str] | None = None, make_fitness: Callable | None = None) ->
     code = run_plans(steps, make, save_pictures, again, arguments.trust)
     if code not in (0, 2):  # runs that failed by themselves leave the others to report on
         return code
-    print("writing the report", flush=True)
+    say("writing the report")
     report = write_report(folder)
     for line in report.lost:
         print(f"warning: {line}", file=sys.stderr)
-    print(f"report: {short_path(report.page)}; {short_path(report.table)}")
+    say(f"report: {short_path(report.page)}; {short_path(report.table)}")
     return code
 
 
 def _check_configs(path: Path, settings: Sequence[str], trust: bool) -> None:
     """Refuses wrong configurations before JAX is imported."""
     from mjx_revolve.episodes.config import load_config
+    from mjx_revolve.episodes.strategy_names import check_strategies
 
     cases = combine(read_axes(settings), path.stem)
     for case, own in cases.items():
         try:
             with opening_config(path, trust):
-                load_config(path, own)
+                check_strategies(load_config(path, own))
         except InputError as error:
             raise InputError(f"{case}: {error}" if len(cases) > 1 else str(error)) from None
 

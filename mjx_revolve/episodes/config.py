@@ -389,7 +389,7 @@ class EvolutionConfig(Settings):
     """Settings of the search over genes."""
 
     strategy: Annotated[str, MinLen(1)] = "CMA_ES"
-    """Name of an evosax strategy; `mjx_revolve.evolution.strategies.STRATEGIES` lists them."""
+    """Name of an evosax strategy; `mjx_revolve.evolution.STRATEGIES` lists them."""
     population_size: Annotated[Integer, Ge(4)] = 64
     generations: Annotated[Integer, Ge(1)] = 60
     seed: Annotated[Integer, Ge(0), Lt(2**32)] = 0

@@ -77,7 +77,7 @@ class Executor:
 
         Raises:
             WorkerError: see `score`.
-            InputError: the population has another shape.
+            InputError: the population has another shape, or the key is none.
         """
         import numpy as np
 
@@ -105,9 +105,13 @@ class Executor:
         Raises:
             WorkerError: no worker is left, or not one block could be scored; the executor is
                 closed.
+            InputError: the key is none.
         """
+        from mjx_revolve.episodes.starts import check_key
+
         if self.closed:
             raise RuntimeError("expected an open executor; found it closed")
+        check_key(key)  # a seed instead is no reason to end the workers
         try:
             return self._score(blocks, key)
         except BaseException:

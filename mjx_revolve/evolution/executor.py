@@ -73,6 +73,8 @@ def make_executor(
         config = load_config(config)
     if workers is None:
         workers = 1 if make_fitness or not on_cpu() else choose_workers(config)
+    if workers < 1:
+        raise InputError("workers", "a whole number >= 1, or None", workers)
     if started and (len(started) != workers or cluster):
         for worker in started:
             worker.end()

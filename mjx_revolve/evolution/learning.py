@@ -17,12 +17,13 @@ import numpy as np
 
 from mjx_revolve.body.tree import Morphology
 from mjx_revolve.episodes.bodies_config import LearningConfig
+from mjx_revolve.episodes.strategy_names import find_strategy
 from mjx_revolve.evolution.blocks import Scored, join, take
 from mjx_revolve.evolution.body_fitness import BodyFitness, Genes
 from mjx_revolve.evolution.brains import GeneLayout
 from mjx_revolve.evolution.executor import Executor
 from mjx_revolve.evolution.individuals import Individual
-from mjx_revolve.evolution.strategies import Strategy, find_strategy, make_strategy
+from mjx_revolve.evolution.strategies import Strategy, make_strategy
 from mjx_revolve.inputs.errors import InputError
 
 
@@ -62,11 +63,11 @@ def make_learner(settings: LearningConfig, size: int) -> Strategy | Perturbation
     try:
         if not once:
             return make_strategy(settings, size)
-        if "strategy" in settings.model_fields_set:  # else nothing of evosax needs to be imported
-            find_strategy(settings.strategy)
+        find_strategy(settings.strategy)
         return Perturbation(settings.population_size, settings.std_init)
     except InputError as error:
-        raise InputError(re.sub(r"^evolution\.", "bodies.learning.", str(error))) from None
+        text = re.sub(r"(^|expected )evolution\.", r"\1bodies.learning.", str(error))
+        raise InputError(text) from None
 
 
 @dataclass

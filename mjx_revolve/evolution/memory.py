@@ -7,7 +7,7 @@ import contextlib
 from pathlib import Path
 
 from mjx_revolve.episodes.config import Config
-from mjx_revolve.evolution.strategies import find_strategy
+from mjx_revolve.episodes.strategy_names import find_strategy
 from mjx_revolve.inputs.errors import InputError
 
 # Memory of an individual: so many copies of its genes, and so many numbers more (scores, ranks,

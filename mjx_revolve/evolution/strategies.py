@@ -7,7 +7,6 @@ that a state read back from a checkpoint is the same thing as one that never lef
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import json
 from dataclasses import dataclass
@@ -21,19 +20,9 @@ from numpy.typing import ArrayLike
 
 from mjx_revolve.episodes.bodies_config import LearningConfig
 from mjx_revolve.episodes.config import EvolutionConfig
+from mjx_revolve.episodes.strategy_names import STRATEGY_NAMES, find_strategy
 from mjx_revolve.inputs.errors import InputError
 
-# SV_CMA_ES and SV_Open_ES evolve several populations side by side, which is another loop.
-_NOT_OFFERED = ("SV_CMA_ES", "SV_Open_ES")
-# Common names, beside evosax's. Case, `-` and `_` do not matter.
-_OTHER_NAMES = {
-    "de": "DifferentialEvolution",
-    "ga": "SimpleGA",
-    "pepg": "PGPE",
-    "discoveredes": "DES",
-    "learnedes": "LES",
-    "learnedga": "LGA",
-}
 # Strategies with the draws of a population in their state, which `tell` uses. Those that draw
 # mirrored pairs (GuidedES, NoiseReuseES, PersistentES) are none: a pair would lose its half.
 _REMEMBER = ("xNES", "MA_ES", "LM_MA_ES", "CR_FM_NES")
@@ -51,7 +40,7 @@ def _strategies() -> dict[str, type]:
     """Evosax's classes by name: imported, in half a second, while workers start."""
     from evosax.algorithms import algorithms
 
-    return {name: kind for name, kind in algorithms.items() if name not in _NOT_OFFERED}
+    return {name: algorithms[name] for name in STRATEGY_NAMES}
 
 
 def __getattr__(name: str) -> dict[str, type]:
@@ -211,30 +200,6 @@ class Strategy:
 
 def _on_host(state: object) -> Any:
     return jax.tree.map(np.asarray, state)
-
-
-def _plain(name: str) -> str:
-    return name.replace("_", "").replace("-", "").replace(" ", "").lower()
-
-
-def find_strategy(name: str) -> str:
-    """Finds a strategy's evosax name.
-
-    Args:
-        name: given by the user; case, `-` and `_` do not matter, and `DE` is an alias.
-
-    Returns:
-        The name in `STRATEGIES`.
-
-    Raises:
-        InputError: there is no such strategy.
-    """
-    known = {_plain(known): known for known in _strategies()} | _OTHER_NAMES
-    if _plain(name) in known:
-        return known[_plain(name)]
-    near = difflib.get_close_matches(_plain(name), known, n=1, cutoff=0.5)
-    hint = f"; did you mean {known[near[0]]}?" if near else ""
-    raise InputError("evolution.strategy", f"one of {', '.join(_strategies())}", f"{name!r}{hint}")
 
 
 def _constructor_settings(

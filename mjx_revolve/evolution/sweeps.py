@@ -29,10 +29,10 @@ from mjx_revolve.evolution.generations import Champion
 from mjx_revolve.evolution.interrupts import Interrupts
 from mjx_revolve.evolution.jobs import MakeFitness, WorkerError
 from mjx_revolve.evolution.progress import is_live
-from mjx_revolve.evolution.run import MakeExecutor, Run, check_search, check_unchanged
+from mjx_revolve.evolution.run import MakeExecutor, Run, check_genes, check_search, check_unchanged
 from mjx_revolve.evolution.run_folder import TEMPORARY, RunFolder, is_new_folder, open_run_folder
 from mjx_revolve.evolution.tensorboard import check_tensorboard
-from mjx_revolve.inputs.commands import check_output_folder, describe_refusal
+from mjx_revolve.inputs.commands import check_output_folder, describe_refusal, say
 from mjx_revolve.inputs.errors import InputError, note, reading
 from mjx_revolve.inputs.files import SWEEP, short_path, write_atomic
 from mjx_revolve.inputs.grids import MOST_SEEDS, combine, read_axes
@@ -173,11 +173,10 @@ class Sweep:
                 raise InputError("--set evolution.seed", "--seeds N instead", "it set")
         return combine(axes, Path(self.config).stem)
 
-    def plans(self, folder: Path) -> list[Plan]:
+    def plans(self, folder: str | Path) -> list[Plan]:
         """Its runs in a folder, all seeds of a case together."""
-        return make_plans(
-            folder, self.config, self.cases, range(self.first_seed, self.first_seed + self.seeds)
-        )
+        seeds = range(self.first_seed, self.first_seed + self.seeds)
+        return make_plans(Path(folder), self.config, self.cases, seeds)
 
 
 def read_sweep(folder: str | Path) -> Sweep:
@@ -270,7 +269,9 @@ def choose_steps(
                 config = plan.config
                 check_tensorboard(config, config.source)
                 with opening_config(plan.base, trust):
-                    check_search(config, executors(config))
+                    executor = executors(config)
+                    check_genes(config, executor)
+                    check_search(config, executor)
             except InputError as error:
                 raise InputError(f"{plan.case}: {error}" if several else str(error)) from None
     return steps
@@ -309,41 +310,41 @@ def run_plans(
             number = f"[{k + 1:{width}}/{len(steps)}]"
             begin = f"{number} {plan.name}: "
             if step == "finished":
-                print(begin + _result(plan, "finished before"))
+                say(begin + _result(plan, "finished before"))
                 continue
             # A terminal's line is drawn over by the run's progress.
             over = f"\r\x1b[K{begin}" if is_live(sys.stdout) else ""
-            print(f"{begin}running ... ", end="", flush=True)
+            say(f"{begin}running ... ", end="")
             started = time.perf_counter()
             try:
                 champion = _run(plan, step, executors, draw, interrupts, number, trust)
             except (WorkerError, OSError) as error:
                 words = describe_refusal(error) if isinstance(error, OSError) else str(error)
-                print(f"{over}failed\ngo on: {again}", flush=True)
+                say(f"{over}failed\ngo on: {again}")
                 print(f"error: {plan.name}: {words}", file=sys.stderr)
                 return 1
             except InputError as error:  # nothing of this run can be judged; the others go on
-                print(f"{over}failed", flush=True)
+                say(f"{over}failed")
                 if str(error).startswith(("--cluster", "--workers")):  # it is the same for all
                     if ran:
-                        print(f"go on: {again}", flush=True)
+                        say(f"go on: {again}")
                     raise
                 print(f"error: {plan.name}: {error}", file=sys.stderr)
                 code, left = 2, left - 1
                 continue
             except BaseException:
-                print(f"{over}failed", flush=True)
+                say(f"{over}failed")
                 raise
             if champion is None:
-                print(f"{over}stopped", flush=True)
+                say(f"{over}stopped")
                 break
             ran += 1
             left -= 1
             rest = left * (time.perf_counter() - began) / ran
             more = f", some {max(1, round(rest / 60))} min left" if left else ""
-            print(over + _result(plan, f"{time.perf_counter() - started:.0f} s{more}"), flush=True)
+            say(over + _result(plan, f"{time.perf_counter() - started:.0f} s{more}"))
     if interrupts.signal and left:
-        print(f"go on: {again}", flush=True)
+        say(f"go on: {again}")
         return interrupts.exit_code
     return code
 

@@ -288,6 +288,14 @@ def show_notes() -> Iterator[None]:
         logger.removeHandler(handler)
 
 
+def say(text: str, end: str = "\n") -> None:
+    """Prints a line; if nothing reads standard output any more, a run goes on in silence."""
+    try:
+        print(text, end=end, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def run_command(main: Callable[[list[str] | None], int], argv: list[str] | None = None) -> int:
     """Runs a command's `main`; wrong input and refusals of the system become one line on stderr.
 

@@ -16,6 +16,7 @@ from mjx_revolve.episodes.tasks import TASKS, score_unit
 from mjx_revolve.evolution.sweeps import Plan
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import csv_table, short_path, write_atomic
+from mjx_revolve.inputs.user_code import content_name
 from mjx_revolve.view.population import read_population
 
 Figures = dict[str, float]
@@ -33,7 +34,8 @@ class Outcome(NamedTuple):
             brains evolve.
         metrics: the columns of `metrics.csv`.
         body: the champion's; None if it could not be read.
-        task: the task's type, and "in metres" where its scores are.
+        task: the task's type, a user's own by what its file holds, and "in metres" where its
+            scores are.
         unit: of the scores; "" where it is not known.
         evolved: whether bodies have evolved.
         colony: whether in a colony: its fitness is not the champion's score.
@@ -109,9 +111,9 @@ def _read_outcome(plan: Plan, add: Callable[[str, Figures], Figures]) -> Outcome
     metrics = run.load_metrics()
     for name in ("generation", "evaluations", "seconds", "champion"):
         _ = metrics[name][-1]
-    task = config.task.type
-    unit = score_unit(task, config.task.unit) if task in TASKS else ""
-    task += " in metres" * (config.task.unit == "m")
+    name = config.task.type
+    unit = score_unit(name, config.task.unit) if name in TASKS else ""
+    task = content_name(name) + " in metres" * (config.task.unit == "m")
     kind = config.bodies is not None, config.colony is not None, config.evolution.generations
     return Outcome(plan, champion, population, metrics, body, task, unit, *kind)
 
