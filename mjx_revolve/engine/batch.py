@@ -311,11 +311,13 @@ def fit_capacity(
         sizes = _widest_bodies(columns, sizes, modules)
     # Of one name there may be several, with params of their own.
     types = {id(k): k for k in (*(m.kind for r in robots for m in r.morphology.modules), *kinds)}
-    # Nothing acts on what neither floats nor drags nor carries nor pushes.
-    every = [x for x in columns.laws if not x.idle or carries or world.self_contact]
+    near = contact and world.bed is not None
+    # Nothing acts on what neither floats nor drags nor carries nor pushes, unless it may meet
+    # something: room for points and boxes follows from that for parts.
+    meets = world.self_contact or (near and bool(modules))
+    every = [x for x in columns.laws if not x.idle or carries or meets]
     if modules:
         hinges = max(hinges, int(sizes.hinges.max()))
-    near = contact and world.bed is not None
     groups, order = _choose_groups(columns, sizes, every, bool(modules))
     count = max(1, rows, hinges, int(order.length.max()))
     slots = 1 + int(order.slot.max(initial=0))

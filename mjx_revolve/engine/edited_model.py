@@ -11,7 +11,12 @@ import mujoco
 import numpy as np
 
 from mjx_revolve.engine.assembly import Assembly
-from mjx_revolve.engine.step_constants import LIMIT_OVERSHOOT, StepConstants, motor_line
+from mjx_revolve.engine.step_constants import (
+    LIMIT_OVERSHOOT,
+    NO_LIMIT,
+    StepConstants,
+    motor_line,
+)
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.numerics.spatial import quat_to_matrix
 
@@ -76,6 +81,10 @@ def check_edit(model: mujoco.MjModel, built: mujoco.MjModel, name: str) -> None:
             fits, wanted = fits and (numbers >= 0).all(), f"{wanted} >= 0"
         if not fits:
             raise InputError(f"model of {name!r}: {x}", wanted, show(numbers.ravel().tolist()))
+    speeds = model.jnt_user[1:, 0]  # of the hinges; the core's joint has none
+    if not np.all(speeds > 0):
+        expected, found = "top speeds > 0, infinite for none", show(speeds.tolist())
+        raise InputError(f"model of {name!r}: jnt_user", expected, found)
     limits = {"jnt_range": "jnt_limited", "actuator_forcerange": "actuator_forcelimited"}
     for x, limited in limits.items():
         low, high = getattr(model, x)[getattr(model, limited).astype(bool)].T
@@ -143,7 +152,7 @@ def edited_constants(
         "armature": model.dof_armature[dof],
         "gain": model.actuator_gainprm[act, 0],
         "servo_damping": -model.actuator_biasprm[act, 2],
-        "effort": tuple(effort.T),
+        "effort": tuple(np.clip(effort, -NO_LIMIT, NO_LIMIT).T),  # 0 times infinity is no gradient
         "target": tuple(target.T),
         "range": tuple(limits.T),
         "stop": strong / LIMIT_OVERSHOOT,

@@ -74,6 +74,8 @@ def body_geometries(assembly: Assembly) -> BodyGeometry:
     corners = layout.core_corners()
     across = np.hypot(corners[..., 0], corners[..., 1])
     mass = np.bincount(layout.body, table.mass)
+    if assembly.inertia_axes is not None:  # an edited model has masses of its own
+        mass = assembly.mass.sum(keepdims=True)
     heavy = _mass_center(assembly)
     lever = _buoyancy_center(assembly) - heavy
     arm = np.linalg.norm(lever, axis=1, keepdims=True)

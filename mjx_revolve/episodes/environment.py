@@ -197,6 +197,8 @@ class Environment:
         fitness, episodes, plant = self.fitness, state.episodes, self.fitness.engine.plant
         if action.shape[0] != len(self.action_names):
             raise InputError("action", f"{len(self.action_names)} numbers", action.shape[0])
+        # Whole numbers would round the ends of ranges to 0.
+        action = jnp.asarray(action, jnp.result_type(action, 0.0))
         share = plant.arrange(jnp.clip(action, -1, 1))
         ctrl = plant.middle(share) + plant.reach(share) * share
         before, starts = episodes.rollout, episodes.starts

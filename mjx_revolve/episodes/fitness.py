@@ -428,7 +428,8 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
         """
         padded = [self.pad_genes(own, robot) for own, robot in zip(genes, robots, strict=True)]
         bodies, trials = self.pack(robots), jnp.full(len(padded), trial, jnp.int32)
-        rows = jax.tree.map(np.asarray, self._trace(bodies, jnp.stack(padded), key, trials))
+        population = self.check_population(jnp.stack(padded))
+        rows = jax.tree.map(np.asarray, self._trace(bodies, population, key, trials))
         source, step = np.asarray(bodies.plant.source), self.trace_every * self.world.timestep
         varied = self.variation(key, trial)
         return [

@@ -195,7 +195,7 @@ def read_generations(folder: Path) -> tuple[dict[int, tuple[int, ...]], list[str
     return dict(sorted((line.generation, line.living) for line, _ in lines)), wrong
 
 
-def read_events(folder: Path) -> tuple[list[Event], list[str]]:
+def read_events(folder: str | Path) -> tuple[list[Event], list[str]]:
     """The events of a colony.
 
     Args:
@@ -204,7 +204,7 @@ def read_events(folder: Path) -> tuple[list[Event], list[str]]:
     Returns:
         The events in the order of time, and a line about each thing that is wrong.
     """
-    lines, wrong = _read_lines(folder / EVENTS, _Event)
+    lines, wrong = _read_lines(Path(folder) / EVENTS, _Event)
     events = [
         Event(x.time, x.event, x.id, np.array(x.place, float), x.other, x.cause, x.parents)
         for x, _ in lines

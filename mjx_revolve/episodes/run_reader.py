@@ -12,6 +12,7 @@ import io
 import json
 import re
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +23,7 @@ import numpy as np
 from mjx_revolve.episodes.config import Config, load_config
 from mjx_revolve.inputs.commands import check_no_fit, check_no_sweep
 from mjx_revolve.inputs.errors import InputError, reading, show
-from mjx_revolve.inputs.files import SWEEP, check_path, read_file
+from mjx_revolve.inputs.files import SWEEP, check_path, read_file, short_path
 from mjx_revolve.inputs.schema import Number, Text, TupleOf, read, words
 from mjx_revolve.inputs.yaml_reader import load_yaml
 
@@ -42,8 +43,8 @@ def find_run(path: str | Path) -> Path:
         InputError: it is neither.
     """
     folder = check_path(path)
-    if folder.name == "champion" and not (folder / "config.yaml").is_file():
-        folder = folder.parent
+    if folder.absolute().name == "champion" and not (folder / "config.yaml").is_file():
+        folder = Path(short_path(folder.absolute().parent))  # "." has no parent
     check_no_sweep(folder)
     check_no_fit(folder)
     if not (folder / "config.yaml").is_file():
@@ -81,6 +82,10 @@ class RunReader:
     """
 
     path: Path
+
+    def __post_init__(self) -> None:
+        """Takes a text, too."""
+        self.path = Path(self.path)
 
     @property
     def info(self) -> dict[str, Any]:
@@ -273,7 +278,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
             arrays = arrays_of("array:", file)
     # Errors that the readers raise for a damaged zip, header or JSON.
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, RuntimeError,
-            NotImplementedError, MemoryError, SyntaxError) as error:  # fmt: skip
+            NotImplementedError, MemoryError, SyntaxError, zlib.error) as error:  # fmt: skip
         raise DamageError((str(error) or type(error).__name__).splitlines()[0]) from None
     if not isinstance(meta, dict) or "metrics_position" not in meta:
         raise DamageError("meta is no mapping")

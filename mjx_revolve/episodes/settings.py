@@ -134,6 +134,8 @@ def _map_value(kind: str, place: str, value: object, change: Change) -> object:
     if kind == "data" and not (os.path.isabs(value) and os.path.isfile(value)):
         return value
     if kind == "world" and place.endswith(".current_field"):
+        if value == "off":
+            return value
         kind = "field"
     elif kind == "world" and not _is_path(value):
         return value

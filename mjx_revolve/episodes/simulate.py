@@ -183,6 +183,7 @@ def simulate(
         raise InputError("robot", "what `build_robot` returns", type(robot).__name__)
     if isinstance(ctrl, Controller):
         raise InputError("ctrl", "a controller with its genes, of `bind_genes`", "one without")
+    robot = robot.as_edited()
     model, dt = robot.mj_model, robot.world.timestep
     if key is not None:
         check_key(key)
@@ -192,6 +193,9 @@ def simulate(
         controller, drive_input = ctrl.controller, _array("genes", ctrl.genes, (-1,))
         if drive_input.shape[0] != controller.num_genes:
             raise InputError("genes", f"{controller.num_genes} numbers", drive_input.shape[0])
+        # Programs are kept by their controller, and users may have given it lists.
+        named = ("gene_names", "genes", "signals")
+        controller = controller._replace(**{x: tuple(getattr(controller, x)) for x in named})
     elif ctrl is not None and not callable(ctrl):
         rows = _array("ctrl", ctrl, None)
         if rows.ndim not in (1, 2) or rows.shape[-1] != model.nu or rows.shape[0] == 0 < model.nu:
@@ -233,6 +237,7 @@ def simulate(
         noise = noise_key(jax.random.key(0) if key is None else key)
         context = context._replace(noise=jax.random.bits(noise, (), "uint32"))
     context = jax.tree.map(jnp.asarray, context)
+    context = context._replace(noise=jnp.asarray(context.noise).astype(jnp.uint32))
     if variation is not None:
         if engine != "population":
             raise InputError("variation", f"none, as engine is {engine}", "some")

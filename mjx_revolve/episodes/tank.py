@@ -229,6 +229,8 @@ class Tank:
         Args:
             shift: `[3, places]` world frame [m].
         """
+        new = self._slots["new"]  # they have a start, and no state yet
+        self._slots["start"][:3, new] += shift[:, new]
         if self.state is None:
             return
         state = self.state.state
@@ -246,14 +248,14 @@ class Tank:
         Raises:
             InputError: these are no three finite numbers.
         """
-        found = np.asarray(current, np.float32)
+        found = np.array(current, np.float32)
         if found.shape != (3,) or not np.all(np.isfinite(found)):
             raise InputError("current", "three numbers [m/s]", list(current))
         self._current = found
 
     def set_targets(self, target: np.ndarray | None) -> None:
         """Sets the target of each robot's sensors, `[3, places]` world frame [m]; None: none."""
-        self.target = None if target is None else np.asarray(target, np.float32)
+        self.target = None if target is None else np.array(target, np.float32)
 
     def _put(self, place: int, robot: Robot) -> None:
         """Writes a robot's tables into its place."""
@@ -342,7 +344,9 @@ class Tank:
         water = Water(world.surface_height, tuple(given.current), time=given.time)
         rollout = Rollout(engine, policy, world, water, context, signals, birth=given.since)
         state = start_at_rest(engine, given.start)
-        return rollout, rollout.init(state, controller.init(parameters))
+        # What is one number for all would be one for each robot from the first step on.
+        wide = lambda x: x if x.ndim else jnp.broadcast_to(x, given.noise.shape)  # noqa: E731
+        return rollout, rollout.init(state, jax.tree.map(wide, controller.init(parameters)))
 
     def _blank(self, given: _Given) -> RolloutState:
         """Zeros of its shapes."""

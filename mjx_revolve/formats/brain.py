@@ -120,7 +120,7 @@ def champion_brain(fitness: Fitness, genes: ArrayLike) -> Brain:
         The brain.
 
     Raises:
-        InputError: its step has an operation that files cannot hold.
+        InputError: genes are too few or many, or its step has an operation that files cannot hold.
     """
     observer, rate = fitness.controller.observer, fitness.controller.rate
     sensors = () if observer is None else observer.sensors
@@ -154,12 +154,15 @@ def make_brain(
         The brain.
 
     Raises:
-        InputError: its step has an operation that files cannot hold.
+        InputError: genes are too few or many, or its step has an operation that files cannot hold.
     """
     if not robot.mj_model.nu:
         raise InputError("controller", "a robot with hinges or thrusters", "neither")
     plant = plant_of(robot) if rate is None else plant_of(robot).at_rate(rate)
-    parameters = controller.decode(jnp.asarray(genes)[:, None], plant)
+    genes = jnp.asarray(genes, jnp.result_type(np.asarray(genes), 0.0))
+    if genes.shape != (controller.num_genes,):
+        raise InputError("genes", f"[{controller.num_genes}]", list(genes.shape))
+    parameters = controller.decode(genes[:, None], plant)
     initial = jax.tree.map(_wide, controller.init(parameters))
     parameters = jax.tree.map(_wide, parameters)
     readings = _blank_readings(plant, controller.signals, seen)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ _MESHES = "meshes"
 
 def export_robot(
     robot: Robot,
-    files: dict[str, Path],
+    files: Mapping[str, str | Path],
     trajectory: Trajectory | None = None,
     meshes: str | None = None,
     brain: Brain | None = None,
@@ -54,6 +54,7 @@ def export_robot(
             writes bags is missing, or there is no brain for a controller.
         OSError: a file cannot be written.
     """
+    paths = {name: Path(path) for name, path in files.items()}
     done: list[tuple[Path, str]] = []
     start = None if trajectory is None else np.asarray(trajectory.qpos)[0]
     if start is not None and not np.isfinite(start).all():
@@ -65,27 +66,27 @@ def export_robot(
         "sdf": (lambda: make_sdf(robot, prefix, start), "SDF world for Gazebo; meshes beside it"),
     }
     for name, (make, words) in makers.items():
-        if name in files:
-            write_atomic(files[name], make().encode())
-            done.append((files[name], words))
-    folders = {files[name].parent / _MESHES for name in ("urdf", "sdf") if name in files}
+        if name in paths:
+            write_atomic(paths[name], make().encode())
+            done.append((paths[name], words))
+    folders = {paths[name].parent / _MESHES for name in ("urdf", "sdf") if name in paths}
     shapes = make_meshes(robot.morphology) if folders else {}
     for folder in folders:
         for name, mesh in shapes.items():
             content: Any = mesh.export(file_type="stl")
             write_atomic(folder / f"{name}.stl", content)
         done.append((folder, f"{len(shapes)} meshes (STL, m)"))
-    if "mcap" in files:
+    if "mcap" in paths:
         if trajectory is None:
             raise InputError("mcap", "a trajectory", "none")
-        write_bag(robot, trajectory, files["mcap"])
+        write_bag(robot, trajectory, paths["mcap"])
         rows, stamps = pick_rows(robot, trajectory)
         words = f"ROS 2 bag: {stamps[-1] / 1e9:.4g} s, {len(rows)} poses"
-        done.append((files["mcap"], f"{words} of {len(make_links(robot))} links"))
-    if "controller" in files:
+        done.append((paths["mcap"], f"{words} of {len(make_links(robot))} links"))
+    if "controller" in paths:
         if brain is None:
             raise InputError("controller", "a brain", "none")
-        done += _write_brain(brain, files["controller"])
+        done += _write_brain(brain, paths["controller"])
     return done
 
 

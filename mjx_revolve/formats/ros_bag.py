@@ -33,7 +33,7 @@ RATE = 100.0
 _LATCHED = ("/tf_static", "/robot_description")
 
 
-def write_bag(robot: Robot, trajectory: Trajectory, path: Path) -> None:
+def write_bag(robot: Robot, trajectory: Trajectory, path: str | Path) -> None:
     """Writes a trajectory.
 
     - `/tf` (`tf2_msgs/TFMessage`): `odom` to `base_link`, and each link from its parent;
@@ -59,6 +59,7 @@ def write_bag(robot: Robot, trajectory: Trajectory, path: Path) -> None:
         OSError: the file cannot be written.
     """
     check_package("--mcap", "rosbags")
+    path = Path(path)
 
     def write(place: Path) -> None:
         with tempfile.TemporaryDirectory() as folder:

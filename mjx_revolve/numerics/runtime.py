@@ -66,6 +66,8 @@ def fix_environment() -> None:
     """
     _fix_threads()
     flags = os.environ.get("XLA_FLAGS", "")
+    if flags.strip()[:1] not in ("", "-"):  # to XLA, the path of a file with flags
+        return
     if expects_cpu() and "xla_backend_extra_options" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {_LLVM}".strip()
 
@@ -106,6 +108,9 @@ def find_cache() -> Path | None:
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     if "jax" in sys.modules and (known := sys.modules["jax"].config.jax_compilation_cache_dir):
         chosen = known
+    if chosen and "://" in chosen:
+        _log.warning("no compilation cache: expected a folder; found %s", chosen)
+        chosen = ""
     folder = cache_folder() if chosen is None else (Path(chosen).absolute() if chosen else None)
     if folder is not None:
         try:
@@ -244,15 +249,13 @@ def _is_whole(data: bytes) -> bool:
             import zstandard
         except ImportError:
             return True
-        try:
-            zstandard.ZstdDecompressor().decompressobj().decompress(data)
-        except zstandard.ZstdError:
-            return False
-        return True
-    decompressor = zlib.decompressobj()
+        error: type[Exception] = zstandard.ZstdError
+        decompressor: Any = zstandard.ZstdDecompressor().decompressobj()
+    else:
+        decompressor, error = zlib.decompressobj(), zlib.error
     try:
         decompressor.decompress(data)
-    except zlib.error:
+    except error:
         return False
     return decompressor.eof
 
@@ -284,12 +287,16 @@ def remove_broken_entries(folder: Path) -> list[str]:
             if not _is_whole(entry.read_bytes()):
                 entry.unlink()
                 removed.append(entry.name)
-        except FileNotFoundError:  # another process has removed it
+        except (FileNotFoundError, PermissionError):  # removed meanwhile, or another user's
             continue
     if newest > checked:
-        marker.touch()
-        # One tick earlier than the newest entry: one written within the same tick is read again.
-        os.utime(marker, (newest - 0.001, newest - 0.001))
+        try:
+            marker.touch()
+            # One tick earlier than the newest entry: one of the same tick is read again.
+            os.utime(marker, (newest - 0.001, newest - 0.001))
+        except PermissionError:  # another user's, in a folder that several share
+            if not os.access(folder, os.W_OK):
+                raise
     return removed
 
 

@@ -222,6 +222,10 @@ def test_room_for_all_bodies_of_so_many_modules():
     assert packed.count.max() <= capacity.rows <= packed.count.max() + 4
     with pytest.raises(InputError, match="expected at most 7 hinges; found 8"):
         pack_bodies([build_robot(random_body(0, 8, 0), tank)], capacity)
+    # On land what nothing but the bed acts on touches it.
+    land = world(buoyancy="off", drag="off", added_mass=False, self_contact=False, bed=BED)
+    room = fit_capacity([build_robot(random_body(0, 4, 1), land)], modules=15)
+    assert min(room.points, room.root_points) >= 8
     # A drag law of whole bodies lets no part of them overflow into another row.
     tank = world(drag="inertia_box")
     capacity = fit_capacity([build_robot(random_body(0, 4, 1), tank)], hinges=7, modules=15)

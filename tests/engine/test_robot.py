@@ -3,19 +3,23 @@
 import copy
 import pickle
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from laboratory import OURS, WILD, body, face_drag, need_mjx, read, world
+from laboratory import OURS, WILD, body, check_refused, face_drag, need_mjx, read, world
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.engine.batch import fit_capacity
 from mjx_revolve.engine.engines import make_engine
+from mjx_revolve.engine.plant import body_geometry
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.single_tree import make_single_tree
 from mjx_revolve.episodes.simulate import simulate
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.bed import Bed, bed_height
+from mjx_revolve.water.flow import water_of
 from mjx_revolve.water.lift_drag import LIFT_DRAG
 from mjx_revolve.water.world import load_world
 from references import rotation
@@ -186,6 +190,24 @@ def test_an_edited_model_is_a_new_robot(kind):
     assert make_engine(other, "mjx").robot.mj_model.dof_damping[9] == 0.5
 
 
+def test_a_servo_without_a_limit_has_a_gradient():
+    robot = build_robot(body("snake"), world())
+    edit = copy.copy(robot.mj_model)
+    edit.actuator_forcelimited[:], edit.body_mass[:] = 0, 2 * edit.body_mass
+    edited = robot.with_model(edit)
+    heavy, light = (body_geometry(x).weight for x in (edited, robot))
+    assert heavy == pytest.approx(2 * light)
+    engine = make_engine(edited)
+    rest = engine.init(jnp.asarray(edit.qpos0)[:, None], jnp.zeros((edit.nv, 1)))
+
+    def speed(ctrl):
+        state, _ = engine.step(rest, ctrl, water_of(robot.world))
+        return jnp.sum(engine.observe(state)[1] ** 2)
+
+    slopes = jax.grad(speed)(jnp.full((robot.num_hinges, 1), 0.1))
+    assert np.isfinite(slopes).all() and np.abs(slopes).max() > 0
+
+
 def test_modules_that_meet_in_an_edited_range_are_found():
     robot = build_robot(body("spider"), world())
     edit = copy.copy(robot.mj_model)
@@ -200,19 +222,18 @@ def test_what_an_edited_model_may_not_change():
     edit = copy.copy(robot.mj_model)
     edit.body_pos[3] += 0.1
     edit.opt.timestep = 0.1
-    with pytest.raises(InputError, match=r"servos only; found another body_pos, opt\.timestep"):
-        robot.with_model(edit)
+    check_refused("servos only; found another body_pos, opt.timestep", robot.with_model, edit)
     edit = copy.copy(robot.mj_model)
     edit.jnt_stiffness[2] = 1.0
     edit.qpos0[8], edit.dof_damping[2], edit.actuator_biasprm[1, 0] = 0.1, 1.0, 0.1
     words = "another jnt_stiffness, qpos0, dof_damping of the core, actuator_biasprm"
-    with pytest.raises(InputError, match=words):
-        robot.with_model(edit)
+    check_refused(words, robot.with_model, edit)
     for name, row, value, words in (
         ("actuator_gainprm", (0, 0), 9.0, "another .*actuator_gainprm of a thruster"),
         ("body_mass", 1, -1.0, "body_mass: expected finite numbers > 0; found"),
         ("dof_damping", 6, np.nan, "dof_damping: expected finite numbers >= 0"),
         ("jnt_range", (1, 1), -2.0, "jnt_range: expected the lowest below the highest"),
+        ("jnt_user", (2, 0), 0.0, "jnt_user: expected top speeds > 0"),
     ):
         jet = build_robot(body("auv" if "gain" in name else "snake"), world())
         edit = copy.copy(jet.mj_model)
@@ -221,11 +242,9 @@ def test_what_an_edited_model_may_not_change():
             jet.with_model(edit)
     spec = robot.mj_spec
     spec.geoms[0].size = [-1.0, 0.0, 0.0]
-    with pytest.raises(InputError, match="expected one that MuJoCo can compile"):
-        robot.with_model(spec)
+    check_refused("expected one that MuJoCo can compile", robot.with_model, spec)
     heavy = robot.with_model(copy.copy(robot.mj_model))
-    with pytest.raises(InputError, match="expected it as built"):
-        fit_capacity([heavy])
+    check_refused("expected it as built", fit_capacity, [heavy])
 
 
 def test_a_model_edited_in_place_counts_from_the_next_engine_on():
@@ -239,11 +258,9 @@ def test_a_model_edited_in_place_counts_from_the_next_engine_on():
         heavy = make_engine(robot)
     assert make_engine(robot) is heavy is not plain
     assert robot.as_edited().assembly.mass[2] == 2 * robot.assembly.mass[2]
-    with pytest.raises(InputError, match="expected it as built"):
-        fit_capacity([robot])
+    check_refused("expected it as built", fit_capacity, [robot])
     robot.mj_model.body_pos[3] += 0.1
-    with pytest.raises(InputError, match="found another body_pos"):
-        make_engine(robot)
+    check_refused("found another body_pos", make_engine, robot)
 
 
 @pytest.mark.slow
