@@ -119,10 +119,11 @@ def _named_paths(out: str, kinds: Sequence[str], name: str) -> dict[str, Path]:
 
 def _run_folder(path: Path) -> Path | None:
     """The run folder that a path belongs to, before anything is read."""
-    if path.is_file() and path.name != "genes.yaml":
-        return None
+    if not path.exists() or (path.is_file() and path.name != "genes.yaml"):
+        return None  # the name of a shipped robot is no path
     base = path.parent if path.is_file() else path
-    return next((f for f in (base, base.parent) if (f / "config.yaml").is_file()), None)
+    above = Path(short_path(base.absolute().parent))  # of the current folder, too
+    return next((f for f in (base, above) if (f / "config.yaml").is_file()), None)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -198,6 +199,10 @@ def main(argv: list[str] | None = None) -> int:
         write_film(made, opengl, paths.get(".mp4"), paths.get(".gif"))
         _say_films(paths, made)
     if episode is not None and ".html" in paths:
+        if not films:  # a film says so itself
+            from mjx_revolve.view.poses import finite_rows
+
+            note_lost(finite_rows(episode)[1])
         from mjx_revolve.view.viewer import write_viewer
 
         write_viewer(episode, paths[".html"])

@@ -68,10 +68,10 @@ def main(argv: list[str] | None = None) -> int:
         check_place(Path(arguments.path) / "any", arguments.path)
     check_episode_path(arguments.path)
     check_colony_arguments(arguments)
-    if arguments.colony:
-        return _write_colony(arguments)
     # JAX takes seconds to import: not for `--help`, nor for wrong files.
     runtime.fix_environment()
+    if arguments.colony:
+        return _write_colony(arguments)
     from mjx_revolve.episodes.early_checks import check_episode_files
 
     check_episode_files(arguments)

@@ -15,7 +15,7 @@ import pytest
 from test_bodies import make_run
 
 from browser import Browser, needs_browser
-from laboratory import body
+from laboratory import body, check_error
 from mjx_revolve import live
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.inputs.commands import run_command
@@ -353,8 +353,7 @@ def test_ctrl_c_ends_it(monkeypatch, capsys):
 )
 def test_mistakes_end_in_one_line(capsys, argv, said):
     assert run_command(live.main, argv) == 2
-    error = capsys.readouterr().err
-    assert error.startswith(f"error: {said}") and error.count("\n") == 1
+    check_error(capsys.readouterr(), f"error: {said}")
 
 
 FACTS = "(document.documentElement?.dataset ?? {})"

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from mjx_revolve.inputs.user_code import short_name
 from mjx_revolve.view.live.robot_catalogue import RobotCatalogue
 from mjx_revolve.view.page_data import pack_water
 from mjx_revolve.view.surroundings import bed_at
@@ -50,6 +51,6 @@ def live_page(catalogue: RobotCatalogue, room: int) -> str:
         "catalogue": [{"name": entry.name, "group": entry.group} for entry in catalogue.entries],
     }
     name = world.name.replace("_", " ")
-    words = [name, f"{catalogue.mixed.config.controller.type} brains", "live"]
+    words = [name, f"{short_name(catalogue.mixed.config.controller.type)} brains", "live"]
     title = catalogue.title or "A running world"
     return fill_page("live", maker="live", title=title, subtitle=" \u00b7 ".join(words), data=data)

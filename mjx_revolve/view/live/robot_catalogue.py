@@ -15,12 +15,13 @@ import numpy as np
 from mjx_revolve.body.morphology import Morphology, load_morphology, trim_neutral
 from mjx_revolve.engine.robot import Robot, build_robot, check_timestep
 from mjx_revolve.engine.spheres import count_spheres
-from mjx_revolve.episodes.config import Config, override_config
+from mjx_revolve.episodes.config import Config, ControllerConfig, override_config
 from mjx_revolve.episodes.early_checks import USUAL_CONFIG, named_kind, read_named_config
 from mjx_revolve.episodes.fitness import MixedFitness, make_mixed_fitness
 from mjx_revolve.episodes.individual_log import INDIVIDUALS, read_individuals
 from mjx_revolve.episodes.named_files import read_modules, read_world
 from mjx_revolve.episodes.run_reader import RunReader, find_run
+from mjx_revolve.episodes.settings import map_files
 from mjx_revolve.episodes.tasks import COLONY_FITNESS, score_unit
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.shipped import find_shipped, list_shipped
@@ -110,17 +111,17 @@ def load_catalogue(paths: Sequence[str], world: str | None = None) -> RobotCatal
             drafts += _bodies(config, water, find_shipped(path, "morphologies"))
             continue
         own = read_named_config(path)
-        if own.controller != config.controller:
+        if _controller(own) != _controller(config):
             alike = f"that of {sources[0]}, as all robots of a world have one kind"
             raise InputError(f"{path}: controller", alike, f"another ({own.controller.type})")
         if kind == "run":
             drafts += _run_drafts(own, water, Path(path))
         elif own.bodies is None:
             assert own.morphology is not None
-            drafts += _bodies(config, water, Path(own.morphology))
+            drafts += _bodies(own, water, Path(own.morphology))
         else:
             for seed in own.bodies.seeds:
-                drafts += _bodies(config, water, Path(seed))
+                drafts += _bodies(own, water, Path(seed))
     shipped = list_shipped("morphologies")
     for name in sorted(shipped, key=lambda name: (name != _FIRST, name)):
         known = {(draft.short, draft.name) for draft in drafts}
@@ -136,6 +137,12 @@ def load_catalogue(paths: Sequence[str], world: str | None = None) -> RobotCatal
     robots = {key: build_robot(body, mixed.world) for key, body in bodies.items()}
     entries = tuple(_entry(mixed, draft, robots[id(draft.body)]) for draft in drafts)
     return RobotCatalogue(mixed, entries, title)
+
+
+def _controller(config: Config) -> dict[str, Any]:
+    """The controller's settings, files by what they hold: each run has copies of its own."""
+    data = config.controller.model_dump()
+    return map_files(data, lambda file: (file.function, file.digest()), ControllerConfig)
 
 
 def _can_swim(morphology: Morphology, water: World) -> bool:

@@ -76,7 +76,8 @@ class LiveServer(ThreadingHTTPServer):
     def origins(self) -> tuple[str, ...]:
         """The server's addresses in a browser's `Origin` header."""
         port = self.server_address[1]
-        return tuple(f"http://{name}:{port}" for name in (HOST, "localhost"))
+        end = "" if port == 80 else f":{port}"  # browsers leave out the usual one
+        return tuple(f"http://{name}{end}" for name in (HOST, "localhost"))
 
     @property
     def address(self) -> str:

@@ -158,7 +158,7 @@ class Live extends Page {
     else if (this.newest !== null || paused) this.wait(null);
     status.paused = paused;
     status.current = current.join();
-    if (!this.holding) this.setFlow(current); // what the user drags is newer
+    if (!this.holding && !this.sending) this.setFlow(current); // what the user drags, or has asked for, is newer
   }
 
   showCast(now) {

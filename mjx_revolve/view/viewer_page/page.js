@@ -68,9 +68,9 @@ class Page {
     for (const button of document.querySelectorAll("[data-key]")) all[button.dataset.key] = () => button.click();
     addEventListener("keydown", (event) => {
       if (event.ctrlKey || event.metaKey || event.altKey) return;
-      // A control in focus has its own keys; the time's slider is the page's, and blanks slide nothing.
+      // A control in focus has its own keys; the time's slider is the page's, and letters and blanks slide nothing.
       const own = event.target instanceof HTMLElement && event.target.matches("select, input:not(#scrub)");
-      if (own && !(event.key === " " && event.target.matches("[type=range]"))) return;
+      if (own && !(event.key.length === 1 && event.target.matches("[type=range]"))) return;
       if ([" ", "Enter"].includes(event.key) && event.target instanceof HTMLButtonElement) return; // presses it
       const action = all[event.key] ?? all[event.key.toLowerCase()];
       if (!action) return;

@@ -201,7 +201,7 @@ class Replay extends Page {
       ArrowLeft: ({ shiftKey }) => nudge(-1, shiftKey),
       ArrowRight: ({ shiftKey }) => nudge(1, shiftKey),
       Home: () => this.seek(begin),
-      End: () => this.seek(last),
+      End: () => (this.play(false), this.seek(last)), // or it would begin again at once
       ...(episode && { "[": () => this.parts.stretch(1 / 1.25), "]": () => this.parts.stretch(1.25) }),
     }, rates);
     const scrub = byId("scrub");
@@ -213,7 +213,7 @@ class Replay extends Page {
   // As the address says.
   open(rates) {
     const { options, stage, data, actors } = this;
-    const number = (name, usual) => (options.has(name) && options.get(name) !== "" ? Number(options.get(name)) : usual);
+    const number = (name, usual) => (options.get(name) && isFinite(options.get(name)) ? Number(options.get(name)) : usual);
     stage.resize();
     this.seek(number("t", this.begin));
     this.setRate(rates.includes(number("rate", 1)) ? number("rate", 1) : 1);
