@@ -94,9 +94,10 @@ def _read_per_axis(value: Any, place: str = "") -> Any:
     value = as_tuple(value)
     several = value if isinstance(value, tuple) else (value,)
     plain = all(isinstance(x, int | float) and not isinstance(x, bool) for x in several)
-    if len(several) not in (1, 3) or not plain or not all(0 <= x <= LARGEST for x in several):
+    wrong = isinstance(value, tuple) and len(value) != 3
+    if wrong or not plain or not all(0 <= x <= LARGEST for x in several):
         raise ConstraintError(place, "a number >= 0, or three, one for each axis", show(value))
-    return tuple(map(float, value)) if isinstance(value, tuple) and len(value) == 3 else value
+    return tuple(map(float, value)) if isinstance(value, tuple) else value
 
 
 PerAxis = Annotated[

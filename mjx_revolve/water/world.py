@@ -240,7 +240,7 @@ def load_world(name: str | Path, **overrides: Any) -> World:
     for key, value in overrides.items():
         # A mapping changes what it names and keeps the rest: a bed's friction, not its whole shape.
         below = fields.get(key)
-        if key == "bed" and isinstance(below, int | float):
+        if key == "bed" and isinstance(below, int | float) and not is_off(below):
             below = {"height": below}
         if isinstance(below, Mapping) and isinstance(value, Mapping):
             length = {"period", "wavelength"} & set(value)
@@ -304,7 +304,7 @@ def read_world_files(path: str | Path) -> dict[str, bytes]:
     path = Path(path)
     content, data = read_file(path), load_yaml(path)
     named = data.get("current_field") if isinstance(data, dict) else None
-    if not isinstance(named, str) or not named:
+    if not isinstance(named, str) or not named or is_off(named):
         return {path.name: content}
     with reading(path):
         field = read_file(find_field(named, path.parent))
