@@ -41,12 +41,6 @@ def spider():
 
 
 @pytest.fixture(scope="session")
-def core():
-    """The core alone in deep still water, everything on."""
-    return build_robot(body("core"), load_world("lake"))
-
-
-@pytest.fixture(scope="session")
 def elbow():
     """The smallest body with two hinges, in water."""
     return elbow_robot(world(**WATER))

@@ -196,16 +196,6 @@ def dry_robot(name: str) -> Robot:
     return build_robot(body(name), world())
 
 
-def check_engines(robot: Robot, qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray) -> None:
-    """Half a second in float64, `[n, lanes]` each, comes to the same in MJX's step."""
-    _, q, v, work = march(robot, 0.5, qpos, qvel, ctrl)
-    _, other_q, other_v, other_work = march(robot, 0.5, qpos, qvel, ctrl, engine="mjx")
-    assert np.abs(q[-1] - qpos).max() > 0.05
-    assert other_q == pytest.approx(q, abs=1e-9)
-    assert other_v == pytest.approx(v, abs=1e-7)
-    assert other_work == pytest.approx(work, abs=1e-9)
-
-
 def refusal(function: Callable[..., Any], *given: Any, **more: Any) -> str:
     """What the `InputError` says in which a call ends."""
     with pytest.raises(InputError) as error:
@@ -294,20 +284,6 @@ def make_track(position: Any, interval: float = 1.0, **more: Any) -> Track:
         num_hinges=np.shape(more["angle"])[1] if "angle" in more else 0,
         **{name: jnp.asarray(np.asarray(x, np.float32)[..., None]) for name, x in lanes.items()},
     )  # fmt: skip
-
-
-def check_slope_at_rest(controller: Controller, plant: Plant, sense: SensorReadings) -> None:
-    """The gradient through some steps of a controller is finite where all genes are 0."""
-
-    def last(genes: jax.Array) -> jax.Array:
-        parameters = controller.decode(genes, plant)
-        state = controller.init(parameters)
-        for k in range(3):
-            state, target = controller.step(parameters, state, jnp.asarray(0.3 * k), sense)
-        return jnp.sum(target)
-
-    slope = jax.jit(jax.grad(last))(jnp.zeros((controller.num_genes, 1)))
-    assert jnp.all(jnp.isfinite(slope))
 
 
 def _made_of(text: str) -> Callable[[World], Robot]:

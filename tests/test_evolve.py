@@ -167,7 +167,6 @@ def stopped(folder):
 ],
 )  # fmt: skip
 def test_a_run_stays_the_same_run(stopped, argv, message, capsys):
-    (stopped / "other.yaml").write_text("id: other\n")
     changed = (stopped / "toy.yaml").read_text().replace("speed", "crawl")
     (stopped / "changed.yaml").write_text(changed)
     (stopped / "run" / ".lock").unlink()  # as where the folder was copied

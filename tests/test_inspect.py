@@ -107,7 +107,6 @@ def test_the_picture_is_a_whole_png_in_the_robots_colours(tmp_path):
 ],
 )  # fmt: skip
 def test_bad_arguments_are_one_line_and_code_2(tmp_path, capsys, arguments, message):
-    (tmp_path / "folder.png").mkdir()
     before = sorted(os.listdir(tmp_path))
     assert run(SPIDER, *(argument.format(tmp=tmp_path) for argument in arguments)) == 2
     captured = capsys.readouterr()

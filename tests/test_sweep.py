@@ -24,10 +24,7 @@ RUNS = [f"{case}/seed_{seed}" for case in CASES for seed in (0, 1)]
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with a config, current."""
-    monkeypatch.chdir(tmp_path)
-    toys.write_config(tmp_path / "toy.yaml", population_size=8, generations=5, checkpoint_every=2)
-    return tmp_path
+    return toys.enter_folder(tmp_path, monkeypatch, generations=5)
 
 
 def run_sweep(*argv, make_fitness=make_toy):

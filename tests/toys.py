@@ -56,10 +56,10 @@ def write_config(path: Path, **evolution) -> Path:
     return path
 
 
-def enter_folder(path: Path, monkeypatch) -> Path:
+def enter_folder(path: Path, monkeypatch, **evolution) -> Path:
     """A folder with a configuration, current."""
     monkeypatch.chdir(path)
-    write_config(path / "toy.yaml", population_size=8, checkpoint_every=2)
+    write_config(path / "toy.yaml", **{"population_size": 8, "checkpoint_every": 2} | evolution)
     return path
 
 

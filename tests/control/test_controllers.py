@@ -1,13 +1,9 @@
 """Controllers from genes to targets, and the servos that follow them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from laboratory import ROOT, WATER, at_rest, dry_robot, elbow_robot, march, play, read, world
-from mjx_revolve.body.catalogue import MODULES
-from mjx_revolve.body.morphology import load_morphology
+from laboratory import WATER, at_rest, dry_robot, elbow_robot, march, play, read, world
 from mjx_revolve.control.cpg import make_cpg
 from mjx_revolve.control.gait import describe_gait
 from mjx_revolve.control.readings import SensorReadings
@@ -39,15 +35,6 @@ def test_the_number_of_genes_follows_from_the_body(name):
     assert make_cpg(robot).num_genes == n + pairs
     assert make_sine(robot).num_genes == 3 * n + 1
     assert make_sine(robot, harmonics=3).num_genes == 7 * n + 1
-
-
-def test_a_sine_begins_at_rest_also_where_ranges_are_not_even():
-    hinge = replace(MODULES["ActiveHinge"].hinge, range=(0.0, 1.2))
-    uneven = MODULES | {"ActiveHinge": replace(MODULES["ActiveHinge"], hinge=hinge)}
-    robot = build_robot(load_morphology(ROOT / "morphologies" / "snake.yaml", uneven), world())
-    controller = make_sine(robot)
-    targets, _ = play(controller, plant_of(robot), drawn(controller, 1), 101, STILL)
-    assert not targets[0].any() and targets[-1].all()
 
 
 def described(robot, genes, **settings):

@@ -11,8 +11,7 @@ from laboratory import elbow_robot, world
 from mjx_revolve.control.kinds import find_controller
 from mjx_revolve.control.readings import SensorReadings
 from mjx_revolve.engine.plant import plant_of
-from mjx_revolve.episodes.config import ControllerConfig, load_config
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.episodes.config import ControllerConfig
 
 BLIND = SensorReadings(np.zeros(3), np.zeros(3), (), ())
 GENES = np.random.default_rng(0).normal(size=(40, 3))
@@ -91,10 +90,3 @@ def test_a_cpgs_frequency_depends_neither_on_the_rate_nor_on_the_step(plant):
             for number in (1, 77, 199):
                 x = (expm(matrix * number / 10) @ [0, 0, 1, 1])[:2]
                 assert found[number, :, lane] == pytest.approx(np.pi / 4 * np.tanh(x), abs=1e-8)
-
-
-def test_a_wave_that_cannot_be_sampled_is_refused():
-    with pytest.raises(
-        InputError, match=r"max_frequency: expected at most half of controller.rate"
-    ):
-        load_config("smoke", {"controller.max_frequency": 11.0})

@@ -78,13 +78,6 @@ def test_acceleration_is_mujocos(drag):
 
 
 @pytest.mark.slow
-def test_acceleration_in_float32():
-    """Within 1e-5, what the population works with."""
-    robot = stock(lab.elbow_robot(lab.world(gravity=9.81)))
-    check_acceleration(robot, error=2e-5, x64=False)
-
-
-@pytest.mark.slow
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("path", REAL, ids=lambda p: f"{p.parent.name}-{p.stem}")
 def test_acceleration_of_real_bodies(path):
@@ -92,13 +85,6 @@ def test_acceleration_of_real_bodies(path):
     morphology = load_morphology(path, allow_overlap=True)
     robot = stock(build_robot(morphology, lab.world(gravity=9.81, drag="inertia_box")))
     check_acceleration(robot, "inertia_box", lanes=16, error=2e-5, x64=False)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("drag", MUJOCO_LAWS)
-def test_acceleration_of_the_spider_in_float64(drag):
-    robot = stock(build_robot(lab.body("spider"), lab.world(gravity=9.81, drag=drag)))
-    check_acceleration(robot, drag, lanes=16)
 
 
 LIMB = """
@@ -216,7 +202,12 @@ def test_the_two_engines_agree(case):
     qpos, qvel, ctrl = drawn(robot, 4, speed=0.3)
     qpos[2] = [-0.2, -0.05, 0.0, 0.1]
     ctrl[:, 1] *= 3.0
-    lab.check_engines(robot, qpos, qvel, ctrl)
+    _, q, v, work = lab.march(robot, 0.5, qpos, qvel, ctrl)
+    _, other_q, other_v, other_work = lab.march(robot, 0.5, qpos, qvel, ctrl, engine="mjx")
+    assert np.abs(q[-1] - qpos).max() > 0.05
+    assert other_q == pytest.approx(q, abs=1e-9)
+    assert other_v == pytest.approx(v, abs=1e-7)
+    assert other_work == pytest.approx(work, abs=1e-9)
 
 
 @pytest.mark.slow
@@ -290,6 +281,6 @@ def test_convergence_in_the_time_step():
 
 
 @pytest.mark.slow
-def test_an_unknown_engine_is_refused(core):
+def test_an_unknown_engine_is_refused(elbow):
     with pytest.raises(InputError, match=r"^engine: expected one of population, mjx; found 'c'$"):
-        make_engine(core, "c")
+        make_engine(elbow, "c")

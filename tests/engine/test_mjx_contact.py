@@ -44,16 +44,6 @@ def sunk(robot, weight):
     return depth
 
 
-def test_the_setting():
-    """Penalty unless told otherwise; an override keeps the rest of the bed."""
-    assert Bed().contact == "penalty"
-    lake = load_world("lake")
-    assert lake.bed.contact == "penalty"
-    assert load_world("lake", bed={"contact": "mjx"}).bed == Bed(
-        "lake", lake.bed.height, lake.bed.highest, lake.bed.extent, contact="mjx"
-    )
-
-
 REFUSED = (
     "bed.contact: expected 'penalty' with engine: population; found 'mjx' "
     "(choose engine: mjx, or contact: penalty)"

@@ -6,8 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from laboratory import OAR, QUICK, body, swimmer
-from mjx_revolve import InputError, make_fitness
+from laboratory import OAR, QUICK, body, check_refused, swimmer
+from mjx_revolve import make_fitness
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes import passport
 from mjx_revolve.episodes.fitness import fit_body
@@ -166,11 +166,9 @@ def test_a_passport_comes_back_from_its_file(tmp_path):
     assert load_passport(path) == found and found.failed == ("drag",)
     assert [row[3] for row in found.rows] == ["passes", "FAILS", ""]
     path.write_text(found.to_text().replace("0.9", "much"))
-    with pytest.raises(InputError, match=r"checks.kept.value: expected a number; found 'much'"):
-        load_passport(path)
+    check_refused("checks.kept.value: expected a number; found 'much'", load_passport, path)
     path.write_text("checks: 3")
-    with pytest.raises(InputError, match="checks: expected a mapping; found 3"):
-        load_passport(path)
+    check_refused("checks: expected a mapping; found 3", load_passport, path)
     assert made(kept=float("nan")).failed == ("kept",)  # what could not be computed passes nothing
 
 

@@ -4,10 +4,9 @@ import jax
 import numpy as np
 import pytest
 
-from laboratory import ELBOW, OAR, read
+from laboratory import ELBOW, OAR, check_refused, read
 from mjx_revolve.episodes.fitness import make_mixed_fitness
 from mjx_revolve.episodes.tank import make_tank
-from mjx_revolve.inputs.errors import InputError
 
 PLACES = 4
 SENSORS = [
@@ -119,8 +118,8 @@ def test_saved_and_loaded_it_goes_on_bit_for_bit(tank, mixed, robots):
     before, after = water.advance(2.0, 0.02), other.advance(2.0, 0.02)
     assert np.array_equal(before.qpos, after.qpos) and np.array_equal(before.energy, after.energy)
     assert np.array_equal(before.time, after.time) and other.time == water.time
-    with pytest.raises(InputError, match="with these robots; found others"):
-        tank().from_arrays(arrays, {0: robots[0]})
+    message = "with these robots; found others"
+    check_refused(message, tank().from_arrays, arrays, {0: robots[0]})
 
 
 def test_robots_do_not_pass_through_each_other(tank, robots):
@@ -159,24 +158,19 @@ def test_a_current_carries_what_keeps_still(tank, robots):
 
 def test_what_cannot_be_is_refused(tank, mixed, robots):
     water = tank()
-    with pytest.raises(InputError, match="robot in place 0; found none"):
-        water.remove(0)
-    with pytest.raises(InputError, match=r"genes: expected \[\.\.\., "):
-        water.add(robots[0], np.zeros(3), (0, 0, -1))
-    with pytest.raises(InputError, match="finite place and a quaternion of some length"):
-        water.add(robots[0], None, (0, 0, np.nan))
-    with pytest.raises(InputError, match="finite place and a quaternion of some length"):
-        water.add(robots[0], None, (0, 0, -1), (0, 0, 0, 0))
-    with pytest.raises(InputError, match="expected a world below 1; found -1"):
-        water.add(robots[0], None, (0, 0, -1), world=-1)
-    with pytest.raises(InputError, match="current: expected three numbers"):
-        water.set_current((0, 1))
-    for place, quat in (((0, 0), (1, 0, 0, 0)), ((0, 0, -1), (1, 0, 0))):
-        with pytest.raises(InputError, match="finite place and a quaternion of some length"):
-            water.add(robots[0], None, place, quat)
+    check_refused("robot in place 0; found none", water.remove, 0)
+    check_refused("genes: expected [..., ", water.add, robots[0], np.zeros(3), (0, 0, -1))
+    for place, quat in (
+        ((0, 0, np.nan), (1, 0, 0, 0)), ((0, 0, -1), (0, 0, 0, 0)), ((0, 0), (1, 0, 0, 0)),
+        ((0, 0, -1), (1, 0, 0)),
+    ):  # fmt: skip
+        message = "finite place and a quaternion of some length"
+        check_refused(message, water.add, robots[0], None, place, quat)
+    message = "expected a world below 1; found -1"
+    check_refused(message, water.add, robots[0], None, (0, 0, -1), world=-1)
+    check_refused("current: expected three numbers", water.set_current, (0, 1))
     for times in ((-1, 0.1), (np.nan, 0.1), (1, 0)):
-        with pytest.raises(InputError, match="expected times > 0 to advance by"):
-            water.advance(*times)
+        check_refused("expected times > 0 to advance by", water.advance, *times)
     assert water.count == 0
     empty = water.advance(1.0, 0.5)
     assert empty.time.tolist() == [0.5, 1.0] and not empty.alive.any()

@@ -371,12 +371,9 @@ def contents(folder):
 @pytest.mark.parametrize("bodies", [
     {"learning": {"population_size": 4, "generations": 2, "strategy": "CMA_ES"},
      "selection": {"reevaluate": True}},
-    pytest.param(ARCHIVE, marks=pytest.mark.slow),
-    pytest.param(
-        {"selection": {"type": "nsga2", "objectives": ["score", "novelty"], "novelty": ["length"]},
-         "genotype": "plasticoding", "brains": {"type": "cppn"}},
-        marks=pytest.mark.slow,
-    ),
+    ARCHIVE,
+    {"selection": {"type": "nsga2", "objectives": ["score", "novelty"], "novelty": ["length"]},
+     "genotype": "plasticoding", "brains": {"type": "cppn"}},
 ], ids=["learning", "map_elites", "plasticoding"])  # fmt: skip
 def test_a_run_that_goes_on_ends_as_one_that_never_stopped(folder, no_pictures, bodies, capsys):
     toys.write_bodies_config(folder / "toy.yaml", bodies)

@@ -30,6 +30,7 @@ from mjx_revolve.evolution.gene_search import GeneEvolution
 from mjx_revolve.evolution.generations import run_generations
 from mjx_revolve.evolution.jobs import Limits, WorkerError, make_job, open_job
 from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics import runtime
 from mjx_revolve.water.world import load_world
 from toys import check_scores, contents, wait_for
@@ -49,10 +50,7 @@ def same_flags():
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch, no_pictures):
-    """A folder with a config, current."""
-    monkeypatch.chdir(tmp_path)
-    toys.write_config(tmp_path / "toy.yaml", population_size=10, checkpoint_every=4)
-    return tmp_path
+    return toys.enter_folder(tmp_path, monkeypatch, population_size=10, checkpoint_every=4)
 
 
 def toy_config(path, **evolution):
@@ -116,6 +114,8 @@ def test_without_workers_or_blocks_a_pool_is_its_fitness():
         assert np.array_equal(executor(population, key), scores)
     with pytest.raises(RuntimeError, match="expected an open executor"):
         executor.evaluate(population, key)
+    with pytest.raises(InputError, match="workers: expected a whole number >= 1, or None; found 0"):
+        make_executor("smoke", 0)
 
 
 @pytest.fixture(scope="module")

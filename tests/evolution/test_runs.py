@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from laboratory import body
+from laboratory import body, check_refused
 from mjx_revolve.body.catalogue import load_modules
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.episodes.champion import load_genes
@@ -188,15 +188,13 @@ def test_full_folder_is_refused(tmp_path, config):
 def test_a_folder_whose_making_was_cut_short_is_a_new_one(tmp_path, run, config):
     run.close()
     os.rename(run.path / "config.yaml", run.path / ".123-config.yaml")
-    with pytest.raises(InputError, match="found one that was not begun; begin it with --out"):
-        runs.open_run_folder(run.path)
+    check_refused("one that was not begun; begin it with --out", runs.open_run_folder, run.path)
     again, _ = runs.create_run_folder(run.path, config)
     again.close()
 
 
 def test_one_process_at_a_time(run):
-    with pytest.raises(InputError, match="expected a run that has stopped; found it running"):
-        runs.open_run_folder(run.path)
+    check_refused("a run that has stopped; found it running", runs.open_run_folder, run.path)
     run.close()
     runs.open_run_folder(run.path).close()
 
@@ -313,8 +311,7 @@ def test_a_checkpoint_ahead_of_its_metrics_is_passed_over(run):
     assert checkpoint.meta["generation"] == 1
     assert "metrics.csv lacks lines" in checkpoint.damaged[0]
     run.metrics_path.write_bytes(b"\xef\xbb\xbf" + run.metrics_path.read_bytes())
-    with pytest.raises(InputError, match="has no line that ends at byte"):
-        run.load_checkpoint()
+    check_refused("has no line that ends at byte", run.load_checkpoint)
 
 
 def test_a_checkpoint_ahead_of_its_logs_is_passed_over(run):
@@ -335,8 +332,7 @@ def test_a_checkpoint_cuts_no_other_files(run, key, value):
         arrays = dict(file)
     meta = json.loads(arrays["meta"].tobytes()) | {key: value}
     np.savez(path, **arrays | {"meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)})
-    with pytest.raises(InputError, match=r"only damaged ones: generation_000001.npz \(meta: "):
-        run.load_checkpoint()
+    check_refused("only damaged ones: generation_000001.npz (meta: ", run.load_checkpoint)
 
 
 @pytest.mark.parametrize("name", ["metrics.csv", "checkpoints"])
@@ -377,8 +373,7 @@ def test_champion_genes_come_back_bit_for_bit(run):
     for place in (run.path, run.path / "champion", run.path / "champion" / "genes.yaml"):
         assert load_genes(place).tobytes() == genes.tobytes()
     (run.path / "champion" / "genes.yaml").write_text("genes: [1, a]")
-    with pytest.raises(InputError, match=r"genes.yaml: genes.1: expected a number; found 'a'"):
-        load_genes(run.path)
+    check_refused("genes.yaml: genes.1: expected a number; found 'a'", load_genes, run.path)
     with pytest.raises(InputError, match=r"inputs: expected a run folder; found no config.yaml"):
         load_genes(run.path / "inputs")
     for huge in ("1" + 400 * "0", ".nan", "-.inf", "1e39", "true"):

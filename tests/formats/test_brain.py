@@ -155,13 +155,10 @@ def as_given(brain, readings):
     return {signal.name: found[signal.name] for signal in brain.signals}
 
 
-def run_python(text, brain, readings, real=None):
-    space = {}
+def run_python(text, brain, readings, real="float32"):
+    space, text = {}, text.replace("REAL = np.float32", f"REAL = np.{real}")
     exec(compile(text, "brain.py", "exec"), space)
     assert not {"jax", "mjx_revolve"} & set(space)
-    if real is not None:
-        space = {}
-        exec(compile(text.replace("REAL = np.float32", f"REAL = np.{real}"), "b", "exec"), space)
     made = space["Brain"]()
     return np.array(
         [made.step(k / space["RATE"], given) for k, given in enumerate(readings)], np.float64
@@ -248,7 +245,7 @@ def test_in_double_precision_they_agree_to_rounding(kind, tmp_path, monkeypatch)
         draw, rows, expected = np.random.default_rng(5), [], []
         step = jax.jit(controller.step)
 
-        def any_of(x, present=False):
+        def any_of(x):
             if x.dtype == bool:
                 return jnp.asarray(draw.random(x.shape) < 0.5)
             if x.dtype == jnp.uint32:

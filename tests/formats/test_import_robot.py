@@ -133,9 +133,8 @@ def test_a_urdf_of_boxes_and_cylinders(tmp_path):
     found = import_robot(path)
     model = built(found).mj_model
     # MuJoCo has no free base and no rod on its slide: both are given to it.
-    text = URDF.replace('type="prismatic"', 'type="fixed"').replace(
-        "<robot ", '<robot ', 1
-    ).replace('<link name="base">', '<mujoco><compiler fusestatic="false"/></mujoco>'
+    text = URDF.replace('type="prismatic"', 'type="fixed"')
+    text = text.replace('<link name="base">', '<mujoco><compiler fusestatic="false"/></mujoco>'
               '<link name="world"/><joint name="root" type="floating"><parent link="world"/>'
               '<child link="base"/></joint><link name="base">')  # fmt: skip
     np.testing.assert_allclose(

@@ -10,7 +10,7 @@ from importlib import metadata
 
 import pytest
 
-from laboratory import ROOT, refusal
+from laboratory import ROOT, check_error, refusal
 from mjx_revolve.inputs import packages
 from mjx_revolve.inputs.commands import (
     Parser,
@@ -71,7 +71,7 @@ def test_wrong_arguments_are_one_line_and_code_2(argv, message, capsys):
     parser.add_argument("--count", type=whole(1))
     assert run_command(lambda argv: parser.parse_args(argv) and 0, argv) == 2
     captured = capsys.readouterr()
-    assert captured.err.startswith(f"error: {message}") and captured.err.count("\n") == 1
+    check_error(captured, f"error: {message}")
     assert captured.out == ""
 
 
@@ -147,9 +147,8 @@ def test_mixed_installations_of_mujoco_are_refused_at_start(monkeypatch, capsys)
     check_mujoco()
     of_mujoco(monkeypatch, **{"mujoco": "3.17.0", "mujoco-core": "4.0.0"})
     assert run_command(lambda argv: 0, []) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: mujoco: expected one version; found 3.17.0 with a mujoco-core")
-    assert error.count("\n") == 1
+    message = "error: mujoco: expected one version; found 3.17.0 with a mujoco-core"
+    check_error(capsys.readouterr(), message)
 
 
 CODE = (  # in ASCII itself

@@ -366,14 +366,11 @@ def look_around(folder, *places):
     """All that one can do with a run, up to where it takes long."""
     run = folder / "run"
     with watching(folder):
-        try:
-            read_run("run")
-        except InputError as error:
-            check_message(str(error), "run", *places)
-        try:
-            load_archive("run")
-        except InputError as error:
-            check_message(str(error), "run", *places)
+        for read in (read_run, load_archive):
+            try:
+                read("run")
+            except InputError as error:
+                check_message(str(error), "run", *places)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evolve, "_evolve", malformed.stop)
         argv = ["--resume", "run", "--workers", "1"]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import toys
-from laboratory import ELBOW
+from laboratory import ELBOW, check_error
 from mjx_revolve import evolve, export, replay, report, viewer
 from mjx_revolve.episodes.config import load_config
 from mjx_revolve.evolution import run_folder as runs
@@ -59,9 +59,8 @@ def change(folder, **settings):
 def test_nothing_of_a_strangers_is_run_unless_allowed(folder, name, capsys):
     main, argv = COMMANDS[name]
     assert run_command(main, argv) == 2
-    err = capsys.readouterr().err
-    assert "run/inputs/own.py: expected a Python file that you have used before, or --trust" in err
-    assert err.count("\n") == 1
+    message = "run/inputs/own.py: expected a Python file that you have used before, or --trust"
+    check_error(capsys.readouterr(), message)
     assert not (folder / "was run").exists()
     assert not (folder / "out").exists()
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
+from laboratory import check_refused
 from mjx_revolve import report, viewer
 from mjx_revolve.episodes.champion import load_episode
 from mjx_revolve.episodes.individual_log import Event, read_events
@@ -14,7 +15,6 @@ from mjx_revolve.episodes.tasks import COLONY_FITNESS
 from mjx_revolve.evolution.colony_observer import open_colony
 from mjx_revolve.evolve import main
 from mjx_revolve.inputs.commands import run_command
-from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.view.colony_history import make_history
 from mjx_revolve.view.colony_pictures import plot_population
 from mjx_revolve.view.population import trace_line
@@ -143,7 +143,5 @@ def test_the_page_of_a_run(run, capsys):
 def test_other_runs_have_no_colony(tmp_path):
     plain = {"morphology": "spider", "world": "lake", "task": {"type": "speed"}}
     (tmp_path / "config.yaml").write_text(json.dumps(plain))
-    with pytest.raises(InputError, match="expected the run of a colony"):
-        open_colony(tmp_path)
-    with pytest.raises(InputError, match="expected a run folder"):
-        open_colony(tmp_path / "none")
+    check_refused("expected the run of a colony", open_colony, tmp_path)
+    check_refused("expected a run folder", open_colony, tmp_path / "none")

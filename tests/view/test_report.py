@@ -224,7 +224,6 @@ def test_what_is_no_run_is_refused(tmp_path, make):
 
 def test_the_replay_scores_as_evolution_did(lab, copy):
     assert lab["replay"].score == lab["score"]
-    record = read_run(copy)
     for name in ("run.json", "champion/genes.yaml"):
         data = (copy / name).read_text()
         (copy / name).write_text(data.replace(str(lab["score"]), str(lab["score"] + 0.1)))
@@ -460,7 +459,6 @@ def test_a_page_about_what_is_left(copy, quick, capsys):
     (["run"], "run/report.html: expected no file or an earlier report; found another file"),
 ])  # fmt: skip
 def test_wrong_commands(copy, argv, message, capsys):
-    (copy.parent / "empty").mkdir()
     (copy / "report.html").write_text("mine")
     before = sorted(copy.parent.rglob("*"))
     assert run_main(*argv) == 2

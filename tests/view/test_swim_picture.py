@@ -158,9 +158,5 @@ def test_a_single_row_is_a_portrait(elbow):
 
 def test_another_robots_trajectory_is_refused(elbow):
     message = r"trajectory.qpos: expected \[300, 9\] \[T, nq\]; found \[300, 7\]"
-    wrong = replace(swim(elbow), qpos=np.zeros((300, 7)))
     with pytest.raises(InputError, match=message):
-        plot_swim(elbow, wrong)
-    wrong = replace(wrong, qpos=np.full((300, 9), np.nan))
-    with pytest.raises(InputError, match="expected finite numbers in its first row; found none"):
-        plot_swim(elbow, wrong)
+        plot_swim(elbow, replace(swim(elbow), qpos=np.zeros((300, 7))))

@@ -282,7 +282,7 @@ def test_stops_where_numbers_end():
     drift = unpack(episode_data(gusty)["episode"]["drift"], -1, 3)
     assert drift[-1] == pytest.approx([0, 0.14, 0], rel=1e-4)
     qvel[0] = np.inf
-    with pytest.raises(InputError, match="expected finite numbers in its first row; found none"):
+    with pytest.raises(InputError, match="qpos: expected finite numbers in its first row"):
         episode_data(replace(episode, trajectory=replace(episode.trajectory, qvel=qvel)))
 
 

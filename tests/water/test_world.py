@@ -298,7 +298,8 @@ def test_lake_extremes_are_exact():
 
 
 def test_lake_is_always_the_same_and_has_shore_slope_and_basin():
-    first, second = sample_bed(LAKE), sample_bed(load_world("lake").bed)
+    first = sample_bed(LAKE)
+    second = sample_bed.__wrapped__(load_world("lake").bed)  # not what the cache has kept
     assert np.array_equal(first, second)
     assert first.shape == (201, 201)
     assert 0.05 < np.mean(first < -110) < 0.3  # basin
