@@ -80,6 +80,7 @@ def _morphology(generate: Generate) -> Schema:
     definitions |= {"Params": params, "Module": module}
     keys = {"id": name, "body": {"$ref": "#/$defs/Module"}, "brain": {}}
     keys["sensors"] = {"anyOf": [sensors, {"type": "null"}]}
+    keys["coefficients"] = {"type": ["string", "null"]}
     return _file(keys, definitions, ["body"])
 
 
