@@ -87,7 +87,7 @@ class _Template(string.Formatter):
                     value = value[key]
             except (LookupError, TypeError, ValueError):
                 raise KeyError(f"no {key!r} of {name!r} in docs/results") from None
-        if sign:
+        if sign and value is not None:
             value = value * float(number) if sign == "*" else value / float(number)
         return value, name
 

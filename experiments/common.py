@@ -6,6 +6,7 @@ import argparse
 import datetime
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,21 +23,23 @@ RESULTS = ROOT / "docs" / "results"
 """What README and the pages take their figures from; see `docs/figures.py`."""
 
 
-def make_parser(name: str, description: str) -> Parser:
+def make_parser(name: str, description: str, files: bool = True) -> Parser:
     """A parser with the options that all experiments share.
 
     Args:
         name: of the experiment's module.
         description: what it does, in a sentence.
+        files: whether it writes others than that of its results.
 
     Returns:
-        The parser, with `--out` and `--results`.
+        The parser, with `--results` and, for its files, `--out`.
     """
     parser = Parser(
         prog=f"python -m experiments.{name}", description=description, allow_abbrev=False
     )
     add = parser.add_argument
-    add("--out", metavar="DIR", help=f"folder to write into (default: runs/{name})")
+    if files:
+        add("--out", metavar="DIR", help=f"folder to write into (default: runs/{name})")
     add("--results", action="store_true", help="write docs/results as well, which pages show")
     return parser
 
@@ -120,7 +123,7 @@ def today() -> str:
     return datetime.datetime.now(datetime.UTC).date().isoformat()
 
 
-def _study_hash() -> str:
+def study_hash() -> str:
     """A hash of what studies run besides the package: experiments, configurations and robots."""
     found = hashlib.sha256()
     for folder in ("experiments", "configs", "morphologies"):
@@ -128,6 +131,16 @@ def _study_hash() -> str:
             if path.suffix in (".py", ".yaml"):
                 found.update(path.read_bytes())
     return found.hexdigest()[:12]
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON has it; null for a number that is not finite, as pages show none."""
+    if isinstance(value, Mapping):
+        return {key: _plain(x) for key, x in value.items()}
+    value = value.tolist() if hasattr(value, "tolist") else value
+    if isinstance(value, list | tuple):
+        return [_plain(x) for x in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_results(
@@ -138,7 +151,7 @@ def write_results(
     Args:
         name: of the study.
         numbers: numbers, texts, and mappings or lists of these; SI units, or the unit at the end of
-            the key. Numbers of NumPy will do.
+            the key. Numbers of NumPy will do; what is not finite becomes null.
         seeds: that it ran; () where nothing is drawn.
         folder: where to; None: `docs/results`, from where the pages take them.
 
@@ -151,13 +164,12 @@ def write_results(
     result = {
         "study": name,
         "date": today(),
-        "versions": known["versions"] | {"source": source_hash(), "study": _study_hash()},
+        "versions": known["versions"] | {"source": source_hash(), "study": study_hash()},
         "machine": _machine(known),
         "seeds": list(seeds),
         "numbers": numbers,
     }
     path = (folder or RESULTS) / f"{name}.json"
-    plain = lambda value: value.tolist()  # noqa: E731
-    text = json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False, default=plain)
+    text = json.dumps(_plain(result), indent=1, ensure_ascii=False, allow_nan=False)
     write_atomic(path, f"{text}\n".encode())
     return path

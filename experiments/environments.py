@@ -20,7 +20,9 @@ from experiments.studies import Case, describe_runs, draw_outcomes, study_main
 from mjx_revolve.body.descriptors import UNITS
 from mjx_revolve.episodes.measure_table import MEASURES
 from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.files import write_atomic
+from mjx_revolve.inputs.overrides import read_overrides, sets
 from mjx_revolve.view.body_pictures import plot_bodies
 from mjx_revolve.view.convergence import draw_scores
 from mjx_revolve.view.outcomes import Figures, Outcome, by_case, write_csv
@@ -237,11 +239,27 @@ def plot_scores(groups: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
     return figure
 
 
+def make_cases(settings: Sequence[str] = ()) -> Mapping[str, Case]:
+    """The environments.
+
+    Args:
+        settings: what replaces values in all of them, `KEY.PATH=VALUE` each.
+
+    Raises:
+        InputError: one has a value of its own there, which would win in it and in no other.
+    """
+    for key in read_overrides(settings)[0]:
+        for name, case in ENVIRONMENTS.items():
+            if sets(read_overrides(case.settings)[0], key):
+                share = "what all environments share"
+                raise InputError(f"--set {key}", share, f"one of {name}'s own")
+    return ENVIRONMENTS
+
+
 def main(argv: list[str] | None = None) -> int:
     """Runs the study, and reports it."""
     what = "Bodies evolved in four environments."
-    cases = lambda settings: ENVIRONMENTS  # noqa: E731
-    return study_main("environments", what, cases, write_report, argv, through_water)
+    return study_main("environments", what, make_cases, write_report, argv, through_water)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.common import check_whole, make_folder, make_parser, write_results
+from experiments.common import check_whole, make_folder, make_parser, study_hash, write_results
 from mjx_revolve.body.morphology import load_morphology
 from mjx_revolve.engine.robot import Robot, build_robot
 from mjx_revolve.fitting.parameters import read_free, split_free
@@ -27,6 +27,7 @@ from mjx_revolve.fitting.recording import RobotRecording
 from mjx_revolve.fitting.result import Fit, fit_robot
 from mjx_revolve.fitting.synthetic import make_noisy, simulate_signals
 from mjx_revolve.inputs.commands import run_command, whole
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics import runtime
 from mjx_revolve.water.world import load_world
 
@@ -129,15 +130,18 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--robots", default=",".join(FREE))
     arguments: argparse.Namespace = parser.parse_args(argv)
     check_whole(parser, arguments, "robots")
+    names = arguments.robots.split(",")
+    if unknown := [name for name in names if name not in FREE]:
+        raise InputError("--robots", f"any of {', '.join(FREE)}", unknown[0])
     runtime.prepare_process()
     folder = make_folder(arguments.out, "fit_coverage")
     results: dict[str, Any] = {}
     seeds: set[int] = set()
-    for name in arguments.robots.split(","):
+    for name in names:
         path = folder / f"{name}.jsonl"
         lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-        source = runtime.source_hash()
-        # What other code found is none of this study.
+        source = f"{runtime.source_hash()} {study_hash()}"
+        # What other code, or another robot, found is none of this study.
         rows = [row for row in map(json.loads, lines) if row.get("source") == source]
         rows = [row for row in rows if row["seed"] < arguments.cases]
         done = {row["seed"] for row in rows}

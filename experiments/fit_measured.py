@@ -92,7 +92,8 @@ def lamprey_ratios(fit: Fit) -> dict[str, Any]:
 
 def main(argv: list[str] | None = None) -> int:
     """Prints what was predicted."""
-    arguments = make_parser("fit_measured", "Fits to robots that were measured.").parse_args(argv)
+    parser = make_parser("fit_measured", "Fits to robots that were measured.", files=False)
+    arguments = parser.parse_args(argv)
     runtime.prepare_process()
     if arguments.results and not GLIDE.is_file():
         raise InputError("--results", f"the tracks of {GLIDE.name}", "none")

@@ -133,7 +133,8 @@ def measure(make: Callable[..., Made], given: tuple[str, int, int], rounds: int)
     except ImportError as error:
         return {"error": f"not installed ({error.name})"}
     except Exception as error:
-        return {"error": f"{type(error).__name__}: {str(error).splitlines()[0][:80]}"}
+        said = (str(error).splitlines() or ["no message"])[0]
+        return {"error": f"{type(error).__name__}: {said[:80]}"}
     ready, spent = time.perf_counter() - began, []
     for _ in range(rounds):
         began = time.perf_counter()

@@ -87,9 +87,8 @@ def rows() -> list[dict[str, float | str]]:
 
 def main(argv: list[str] | None = None) -> int:
     """Prints both tables."""
-    options = make_parser("module_volumes", "The thesis's Table 1 from our meshes.").parse_args(
-        argv
-    )
+    what = "The thesis's Table 1 from our meshes."
+    options = make_parser("module_volumes", what, files=False).parse_args(argv)
     table = rows()
     print("Module volumes (thesis, Table 1) from our meshes\n")
     print(

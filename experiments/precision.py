@@ -633,13 +633,16 @@ def main(argv: list[str] | None = None) -> int:
     sizes = QUICK if options.quick else Sizes()
     if options.rounds:
         sizes = replace(sizes, rounds=options.rounds)
-    cases = [case for case in CASES if not options.only or options.only in case.name]
+    every = [case for case in CASES if case.robot == "spider"] if options.quick else CASES
+    cases = [case for case in every if not options.only or options.only in case.name]
     if not cases:
-        names = "; ".join(case.name for case in CASES)
+        names = "; ".join(case.name for case in every)
         raise InputError("--only", f"part of one of: {names}", repr(options.only))
     if options.quick:
-        cases = [replace(case, mjx=False) for case in cases if case.robot == "spider"][:2]
-    place = RESULTS if options.results else make_folder(options.out, "precision")
+        cases = [replace(case, mjx=False) for case in cases[:2]]
+    # Short episodes replace no whole ones.
+    own = "precision_quick" if options.quick else "precision"
+    place = RESULTS if options.results else make_folder(options.out, own)
     read_rows("precision", "rows", place)  # refuses those of another machine before anything runs
     for case in cases:
         began = time.monotonic()

@@ -182,6 +182,9 @@ def main(argv: list[str] | None = None) -> int:
         check_finished(every)
     elif code := run_study(every, "senses", argv, lambda start, champion: None):
         return code
+    done = sum(RunReader(plan.folder).is_finished for plan in every)
+    if options.results and done < len(every):
+        raise InputError("--results", f"{len(every)} finished runs", done)
     prepare_process()
     found = {}
     for name, some in plans.items():
@@ -194,7 +197,8 @@ def main(argv: list[str] | None = None) -> int:
         gained = f"{row['difference']['text']} more than `{row['best_open']}`"
         print(f"{row['name']}: {row['closed']['text']} {row['unit']}, {gained}")
     if options.results:
-        write_results("senses", {"tasks": rows, "keys": _KEYS}, range(options.seeds))
+        numbers = {"tasks": rows, "keys": _KEYS, "settings": [*settings]}
+        write_results("senses", numbers, range(options.seeds))
     print(f"written: senses.csv in {short_path(folder)}")
     return 0
 

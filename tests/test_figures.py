@@ -38,6 +38,7 @@ def test_every_figure_is_traced_and_as_its_results_file_has_it(page):
     ("{swim.interval}, {swim.interval.half:.2f}", "0.40 ± 0.10, 0.10"),
     ("{swim.rows.snake.speed:,.0f}", "2,250,000"),
     ("{swim.none:.2f}", "–"),
+    ("{swim.none*100:.1f} %", "– %"),
     ("{swim.words}", "\n\n- one\n- two\n\n"),
 ])  # fmt: skip
 def test_templates(template, shown):

@@ -77,6 +77,7 @@ def test_a_study_runs_what_is_left_and_reports_it(tmp_path, started, monkeypatch
     for options, message in (
         (("--generations", "2"), "expected a run of 2 generations at most; found 3"),
         (("--generations", "3", "--set", "task.duration=7"), "task.duration: expected 12"),
+        (("--generations", "3", "--set", "world.timestep=0.01"), "--set world.timestep: expected"),
     ):
         with pytest.raises(InputError, match=message):
             study(tmp_path, *two, *options)

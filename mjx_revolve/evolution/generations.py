@@ -49,7 +49,7 @@ class Champion:
             Before the final evaluation: the score in its own generation.
         origin: of its genes, in words.
         std: standard deviation over those keys; NaN before.
-        measures: mean of each measure over those keys.
+        measures: mean of each measure over those keys from which no rollout failed.
         key: the first of those keys, to replay; None before.
         body: its body, where bodies have evolved.
         individual: its number, where bodies have evolved.
@@ -251,6 +251,9 @@ def choose_candidate(
                     winner, passport = k, found
                     break
     scores, measures = fresh([winner], REPORT_STREAM, REPORT_EPISODES)
+    sound = scores > FAILED_SCORE
+    if sound.any() and not sound.all():  # what has blown up has no measures
+        measures = {name: values[sound] for name, values in measures.items()}
     return winner, {
         "score": float(scores.mean()),
         "std": float(scores.std()),

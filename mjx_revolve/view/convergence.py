@@ -201,14 +201,19 @@ def draw_curves(
     for k, (name, curves) in zip(numbers or range(len(cases)), cases.items(), strict=True):
         style = style_of(k)
         for x, y in curves:
-            axes.plot(x, y, linewidth=0.7, alpha=0.4, zorder=2, **style)
+            dot = "o" if len(x) < 3 else None
+            axes.plot(x, y, linewidth=0.7, alpha=0.4, zorder=2, marker=dot, markersize=4, **style)
         grid = np.unique(np.concatenate([x for x, _ in curves]))
-        first, last = max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves)
+        # Until then every rollout of a seed has failed: it has no score.
+        begun = [x[np.isfinite(y)][:1] for x, y in curves]
+        first = np.max(begun) if all(map(len, begun)) else np.inf
+        last = min(x[-1] for x, _ in curves)
         grid = grid[(grid >= first) & (grid <= last)]
+        dot = "o" if len(grid) < 3 else None
         mean, half, _ = mean_and_half([np.interp(grid, x, y) for x, y in curves])
         half = half if len(curves) >= FEWEST else np.full(len(grid), np.nan)
         curve_with_band(axes, grid, mean, mean - half, mean + half, linewidth=2.0, zorder=3,
-                        label=f"{name}, n = {len(curves)}", **style)  # fmt: skip
+                        label=f"{name}, n = {len(curves)}", marker=dot, **style)  # fmt: skip
         limits += [y for _, y in curves] + [mean - half, mean + half]
     limit_to_most(axes, limits, limits)
     ends = [float(x[-1]) for curves in cases.values() for x, _ in curves]
@@ -267,7 +272,7 @@ def plot_comparison(groups: Sequence[RunGroup], numbers: Mapping[str, int]) -> F
         {number: name for name, number in numbers.items()},
         {number: own for number, own in curves.items() if own},
         {numbers[group.name]: group.scores() for group in groups},
-        "evaluated individuals" if counted or not records else records[0].round,
+        "evaluations" if counted or not records else records[0].round,
         f"best {what.replace('fitness', 'fitness so far', 1)}",
         groups[0].unit,
     )

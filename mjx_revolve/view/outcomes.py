@@ -40,6 +40,7 @@ class Outcome(NamedTuple):
         evolved: whether bodies have evolved.
         colony: whether in a colony: its fitness is not the champion's score.
         generations: that the run was to have, or intervals.
+        failed: fresh starts from which its champion failed; its score counts them.
     """
 
     plan: Plan
@@ -52,6 +53,7 @@ class Outcome(NamedTuple):
     evolved: bool = True
     colony: bool = False
     generations: int = 0
+    failed: int = 0
 
 
 def find_outcomes(
@@ -115,7 +117,8 @@ def _read_outcome(plan: Plan, add: Callable[[str, Figures], Figures]) -> Outcome
     unit = score_unit(name, config.task.unit) if name in TASKS else ""
     task = content_name(name) + " in metres" * (config.task.unit == "m")
     kind = config.bodies is not None, config.colony is not None, config.evolution.generations
-    return Outcome(plan, champion, population, metrics, body, task, unit, *kind)
+    failed = int(facts.get("failed_starts", 0))
+    return Outcome(plan, champion, population, metrics, body, task, unit, *kind, failed)
 
 
 def by_case(outcomes: Sequence[Outcome], cases: Iterable[str]) -> dict[str, list[Outcome]]:

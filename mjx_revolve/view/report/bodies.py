@@ -8,7 +8,7 @@ import os
 import re
 import shlex
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
@@ -17,6 +17,7 @@ import numpy as np
 from PIL import Image
 
 from mjx_revolve.body.catalogue import MODULES
+from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology
 from mjx_revolve.episodes.champion import load_individuals
 from mjx_revolve.episodes.individual_log import LoggedIndividual
@@ -132,7 +133,10 @@ def _make_cards(
     record: RunRecord, lives: Iterable[LoggedIndividual], at: Path
 ) -> Callable[[LoggedIndividual], Card]:
     """Draws individuals to one scale; the function that it returns makes the card of any."""
-    modules = MODULES if record.config is None else read_modules(record.config)
+    modules: Mapping[str, ModuleType] = MODULES
+    if record.config is not None:
+        with record.noting_damage():
+            modules = read_modules(record.config)
     bodies: dict[int, Morphology] = {}
     for life in lives:
         if life.number not in bodies:

@@ -296,6 +296,7 @@ def _convergence(groups: Sequence[RunGroup]) -> str:
             "below": "how far the search spreads" if record.population is None
             else "how full the archive is, or how large the living are",
             "band": "quartiles" if quartiles else "mean and standard deviation",
+            "of": "the population" if record.population is None else "those born",
             "fitness": svg_source(_plot_fitness(record)),
             "colony": record.history is not None,
         })  # fmt: skip

@@ -28,7 +28,7 @@ KINDS = {
     "damaged": "damaged",
     "missing": "incomplete",
     "unfinished": "not finished",
-    "failed": "failed",
+    "failed": "some starts failed",
     "untrusted": "not shown in full",
     "version": "of another version",
     "changed": "changed",

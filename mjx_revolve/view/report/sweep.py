@@ -118,7 +118,8 @@ def make_report(
     numbered = {cases.index(case): found for case, found in known.items()}
     tasks = dict.fromkeys(found[0].task for found in numbered.values())
     content: list[tuple[str, str, str]] = []
-    unequal = [k for k in _varied(sweep) if k.startswith("task.") and k != "task.type"]
+    apart = ("task.type", "task.unit")  # each has tables of its own
+    unequal = [k for k in _varied(sweep) if k.startswith("task.") and k not in apart]
     for n, task in enumerate(tasks):
         members = {k: found for k, found in numbered.items() if found[0].task == task}
         of = f": {task.replace('_', ' ')}" if len(tasks) > 1 else ""
@@ -193,11 +194,13 @@ def _scores(members: Numbered, cases: Sequence[str], unequal: Sequence[str]) -> 
         ]
         for k, found in members.items()
     ]  # fmt: skip
+    # A colony's fitness is not that of other runs, though their champions have one task.
     curves = {k: [(o.metrics["evaluations"], o.metrics["champion"]) for o in found]
-              for k, found in members.items()}  # fmt: skip
+              for k, found in members.items() if found[0].colony == first.colony}  # fmt: skip
     best = f"best {COLONY_LABEL}" if first.colony else with_unit("best score so far", unit)
-    figure = plot_cases(dict(enumerate(cases)), curves, scores, "evaluated individuals", best, unit)
-    return sections.sweep_scores(header, rows, svg_source(figure), unequal)
+    figure = plot_cases(dict(enumerate(cases)), curves, scores, "evaluations", best, unit)
+    failed = [cases[k] for k, found in members.items() if any(o.failed for o in found)]
+    return sections.sweep_scores(header, rows, svg_source(figure), unequal, failed)
 
 
 def _tests(members: Numbered, cases: Sequence[str]) -> str:
@@ -276,9 +279,15 @@ def _runs(
         if outcome is not None:
             figures = [f"{outcome.metrics['generation'][-1]:.0f}",
                        format_number(outcome.champion["score"]),
-                       f"{outcome.metrics['seconds'][-1]:.0f}", "finished"]  # fmt: skip
+                       f"{outcome.metrics['seconds'][-1]:.0f}", _finished(outcome)]  # fmt: skip
         rows.append([[*cases].index(plan.case), cases[plan.case], link, *figures])
     return sections.sweep_runs(rows)
+
+
+def _finished(outcome: Outcome) -> str:
+    """Of a run that has one."""
+    count = outcome.failed
+    return f"finished; {count} of its champion's fresh starts failed" if count else "finished"
 
 
 def _state(plan: Plan, lost: Sequence[str]) -> str:

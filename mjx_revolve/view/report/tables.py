@@ -60,7 +60,7 @@ def headline(groups: Sequence[RunGroup]) -> list[tuple[str, str]]:
     unit = f" ({group.unit})" if group.unit else ""
     pairs = _of_seeds(group, unit) if len(group.records) > 1 else _of_run(group.records[0], unit)
     colonies = all(record.history is not None for record in group.records)
-    counted = "robots lived" if colonies else "evaluated individuals"
+    counted = "robots lived" if colonies else "evaluations"
     for name, words, scale in (
         ("evaluations", counted, 1), ("seconds", "minutes of evolution", 60)
     ):  # fmt: skip
