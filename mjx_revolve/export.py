@@ -161,12 +161,13 @@ def main(argv: list[str] | None = None) -> int:
     except InputError as error:
         lacking.append(f"no bag: {error}")
         del files["mcap"]
+    build = files.pop("build", None)
     done = export_robot(episode.robot, files, episode.trajectory, arguments.meshes, brain)
-    if "build" in files:
+    if build is not None:
         from mjx_revolve.view.build_page import make_build_page
 
-        write_atomic(files["build"], make_build_page(episode.robot, episode.title).encode())
-        done.append((files["build"], "how to build it; for browsers and printers"))
+        write_atomic(build, make_build_page(episode.robot, episode.title).encode())
+        done.append((build, "how to build it; for browsers and printers"))
     for path, words in done:
         print(plain(f"{short_path(path)}: {words}"))
     for reason in lacking:  # the other formats do not need it

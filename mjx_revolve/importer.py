@@ -18,6 +18,7 @@ from mjx_revolve.inputs.commands import (
     read_path,
     run_command,
 )
+from mjx_revolve.inputs.errors import plain
 from mjx_revolve.inputs.files import short_path
 from mjx_revolve.inputs.xml_reader import load_robot_xml
 
@@ -60,7 +61,7 @@ def main(argv: list[str] | None = None) -> int:
     print(f"{body}, {modules}: {robot.morphology.counts}, {robot.morphology.mass:.4g} kg, "
           f"{1e6 * robot.morphology.volume:.4g} cm³")  # fmt: skip
     for line in robot.missing:
-        print(f"  not taken over: {line}")
+        print(plain(f"  not taken over: {line}"))
     options = shlex.join(["--set", f"morphology={body}", "--set", f"modules={modules}"])
     print(f"evolve it with: {options}")
     return 0

@@ -33,6 +33,9 @@ from mjx_revolve.numerics.xla import materialize
 _FOLLOW, _PULL = 0.2, 10.0
 # The longest step of the phases [s]: a joint with ten neighbours settles without overshoot.
 _PHASE_STEP = 0.0125
+# Phases beyond this lose whole turns [rad]: after hours float32 lacks the digits for their steps.
+# As far as `sincos` is exact; no episode of minutes gets there.
+_MOST_PHASE = 8192.0
 
 
 def make_sensory_cpg(
@@ -136,6 +139,8 @@ def make_sensory_cpg(
             up = apply_matrix(along, sine) - apply_matrix(across, cosine)
             level = apply_matrix(along, cosine) + apply_matrix(across, sine)
             phase = phase + dt * (speed + _PULL * (cosine * up - sine * level))
+        turns = 2 * np.pi * jnp.round(phase / (2 * np.pi))
+        phase = jnp.where(jnp.abs(phase) > _MOST_PHASE, phase - turns, phase)
         if on_bend:
             more = aim[:rows] + respond(on_bend, inputs[few:])
             aim = more if rows == aim.shape[0] else jnp.concatenate([more, aim[rows:]])

@@ -89,10 +89,12 @@ class BodyFitness:
     ) -> np.ndarray:
         """`[bodies]` shares by which scores of bodies with brains change at half the timestep.
 
-        As in passports, in the world's own water.
+        In the world's own water, without gusts: their paths are drawn anew for each timestep.
         """
-        half = {"world.timestep": self.mixed.world.timestep / 2}
-        usual, fine = (self._scores_with(bodies, genes, key, **x) for x in ({}, half))
+        world = self.mixed.world
+        calm: dict[str, Any] = {} if world.gust is None else {"world.gust": None}
+        half = calm | {"world.timestep": world.timestep / 2}
+        usual, fine = (self._scores_with(bodies, genes, key, **x) for x in (calm, half))
         return np.abs(fine - usual) / np.maximum(np.abs(usual), 1e-9)
 
     def kept_shares(

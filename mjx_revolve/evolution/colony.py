@@ -293,16 +293,19 @@ def _charged(colony: Colony, trajectory: TankTrajectory, rules: Rules) -> np.nda
     if energy is None or not energy.chargers or not members:
         return np.zeros(len(members))
     chargers = np.array(energy.chargers)[None, :, None]
-    positions = _positions(members, trajectory, rules)
+    positions = _positions(members, trajectory)
     distance = np.linalg.norm(positions[:, None] - chargers, axis=-1)
     rows = np.nan_to_num(distance, nan=1e9)
     return np.asarray(rules.look * np.sum([share_power(row, energy) for row in rows], 0))
 
 
-def _positions(members: Iterable[Member], trajectory: TankTrajectory, rules: Rules) -> np.ndarray:
-    """`[T, N, 3]` positions of members within the arena [m]."""
+def _positions(members: Iterable[Member], trajectory: TankTrajectory) -> np.ndarray:
+    """`[T, N, 3]` positions of members in the tank, where they touch and are sensed [m].
+
+    Until the end of the interval they may be beyond the arena's edge.
+    """
     slots = [member.slot for member in members]
-    return rules.inside(trajectory.position[:, :, slots].transpose(0, 2, 1))
+    return trajectory.position[:, :, slots].transpose(0, 2, 1).astype(float)
 
 
 # --- deaths and edges
@@ -378,7 +381,7 @@ def mate(colony: Colony, trajectory: TankTrajectory, rules: Rules) -> tuple[Colo
     ]
     if len(ready) < 2:
         return colony, []
-    position = _positions([members[n] for n in ready], trajectory, rules)
+    position = _positions([members[n] for n in ready], trajectory)
     distance = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1)
     nearest = distance.min(0)
     first, second = np.nonzero(np.triu(nearest <= mating.distance, 1))
@@ -404,7 +407,7 @@ def mate(colony: Colony, trajectory: TankTrajectory, rules: Rules) -> tuple[Colo
             children = {**members[mine].children, theirs: have + 1}
             members[mine] = replace(members[mine], busy_until=due, children=children)
         when = int(np.argmin(distance[:, i, j]))
-        middle = (position[when, i] + position[when, j]) / 2
+        middle = rules.inside((position[when, i] + position[when, j]) / 2)
         events.append(_event(now, "mating", pair[0], middle, other=pair[1]))
     return replace(colony, members=members, pending_births=tuple(pending)), events
 

@@ -161,9 +161,14 @@ class ColonyEvolution(IndividualEvolution, Evolution[Colony, ColonyInterval, Tan
             if number not in before.members:
                 slot = self.tank.add(
                     self.fitness.build(member.individual.body), member.individual.genes,
-                    member.position.tolist(), member.quat, noise=number % 2**32,
+                    member.position.tolist(), member.quat, noise=self._noise(number),
                 )  # fmt: skip
                 assert slot == member.slot
+
+    def _noise(self, number: int) -> int:
+        """Seed of the noise of an individual's sensors: another one in each run."""
+        both = np.random.SeedSequence([self.config.evolution.seed, number])
+        return int(both.generate_state(1)[0])
 
     def _set_signals(self, colony: Colony) -> None:
         """Each robot's tag is its share of full fitness, its target the nearest charger."""

@@ -24,6 +24,7 @@ from mjx_revolve.inputs.files import write_atomic
 
 # Where meshes go, beside the files that name them.
 _MESHES = "meshes"
+_FORMATS = "mjcf", "urdf", "sdf", "mcap", "controller"
 
 
 def export_robot(
@@ -50,10 +51,13 @@ def export_robot(
         The files, with a description of each.
 
     Raises:
-        InputError: there is no trajectory for a bag, nothing of it is finite, the package that
-            writes bags is missing, or there is no brain for a controller.
+        InputError: a format is unknown, there is no trajectory for a bag, nothing of it is finite,
+            the package that writes bags is missing, or there is no brain for a controller.
         OSError: a file cannot be written.
     """
+    for name in files:
+        if name not in _FORMATS:
+            raise InputError("files", f"formats of {', '.join(_FORMATS)}", repr(name))
     paths = {name: Path(path) for name, path in files.items()}
     done: list[tuple[Path, str]] = []
     start = None if trajectory is None else np.asarray(trajectory.qpos)[0]

@@ -149,8 +149,8 @@ def _grouped(missing: list[str]) -> tuple[str, ...]:
 
 
 def _color(rgb: tuple[float, ...] | None) -> dict[str, Any]:
-    """A module's params with its colour, if there is one."""
-    return {"params": dict(zip(COLORS, map(float, rgb), strict=True))} if rgb else {}
+    """A module's params with its colour, if there is one; what is brighter than 1 is 1, as seen."""
+    return {"params": dict(zip(COLORS, np.clip(rgb, 0, 1).tolist(), strict=True))} if rgb else {}
 
 
 def _names(given: list[str]) -> list[str]:

@@ -8,6 +8,7 @@ one to one.
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -35,6 +36,8 @@ WORLD, ODOM, BASE = "world", "odom", "base_link"
 _ADDED = "", "_weld", "_propeller", "_propeller_joint"
 # A bed within this depth below the surface is exported [m]: a robot starts 1 m deep.
 _BED_DEPTH = 5.0
+# What stands for no limit, as in SDF: URDF's readers take no infinity.
+_ENDLESS = 1e16
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,8 @@ class Joint:
     Attributes:
         name: of its module, in letters that every program takes.
         axis: `[3]` unit vector, link frame.
-        range: lowest and highest angle [rad]; 0 is the rest pose.
+        range: lowest and highest angle [rad]; 0 is the rest pose; infinite, as the two below, where
+            an edited model has no limit.
         effort: largest torque of the motor [N·m].
         speed: largest speed of the motor [rad/s].
         damping: viscous friction [N·m·s/rad].
@@ -68,8 +72,9 @@ class Joint:
     @property
     def limit(self) -> dict[str, float]:
         """Angles [rad], torque [N·m] and speed [rad/s] as URDF and SDF call them."""
-        low, high = self.range
-        return {"lower": low, "upper": high, "effort": self.effort, "velocity": self.speed}
+        names = "lower", "upper", "effort", "velocity"
+        found = np.clip([*self.range, self.effort, self.speed], -_ENDLESS, _ENDLESS)
+        return dict(zip(names, found.tolist(), strict=True))
 
 
 @dataclass(frozen=True)
@@ -244,14 +249,16 @@ def missing_flow(world: World) -> list[tuple[object, str]]:
 
 def _make_joint(robot: Robot, body: int, name: str) -> Joint:
     model, joint = robot.mj_model, int(robot.mj_model.body_jntadr[body])
-    low, high = map(float, model.jnt_range[joint])
+    endless = -math.inf, math.inf
+    low, high = map(float, model.jnt_range[joint] if model.jnt_limited[joint] else endless)
     [servo] = [k for k in robot.servos if model.actuator_trnid[k, 0] == joint]
     dof = int(model.jnt_dofadr[joint])
+    torque = model.actuator_forcerange[servo] if model.actuator_forcelimited[servo] else endless
     return Joint(
         name=name,
         axis=model.jnt_axis[joint].copy(),
         range=(low, high),
-        effort=float(model.actuator_forcerange[servo, 1]),
+        effort=float(torque[1]),
         speed=float(model.jnt_user[joint, 0]),
         damping=float(model.dof_damping[dof]),
         stiffness=float(model.actuator_gainprm[servo, 0]),

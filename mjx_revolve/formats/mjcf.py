@@ -6,6 +6,8 @@ own fluid set as close to our water as possible; a comment in the file lists the
 
 from __future__ import annotations
 
+import math
+
 import mujoco
 import numpy as np
 
@@ -189,7 +191,8 @@ def _limit_speed(joint: mujoco.MjsJoint, link: Link) -> None:
     """Damping d q̇ + b |q̇| q̇ that equals the servo's effort at its top speed."""
     assert link.joint is not None
     top, damping = link.joint.speed, link.joint.damping
-    joint.damping = [damping, max(link.joint.effort - damping * top, 0.0) / top**2, 0.0]
+    if math.isfinite(top) and math.isfinite(link.joint.effort):
+        joint.damping = [damping, max(link.joint.effort - damping * top, 0.0) / top**2, 0.0]
 
 
 def _water(robot: Robot) -> list[tuple[object, str]]:

@@ -292,6 +292,9 @@ def _forces(robot: Robot, link: Link) -> Iterator[Element]:
         stand_in = find_drag_law(robot.fluid.drag[part.row]).sdf.stand_in
         if stand_in:
             yield PLUGINS[stand_in](robot, part)
+        if stand_in == "lift_drag":  # Gazebo's plugin lacks drag against turning
+            plate: PlateNumbers = part_numbers(LIFT_DRAG, robot.fluid, robot.world)
+            yield _damping(robot, part, [0, 0, 0, *plate.angular[part.row]])
         if part.part.thruster is not None:
             yield _thruster(robot, part)
     if link.joint is not None:
@@ -301,8 +304,8 @@ def _forces(robot: Robot, link: Link) -> Iterator[Element]:
             p_gain=link.joint.stiffness,
             i_gain=0,
             d_gain=0,
-            cmd_max=link.joint.effort,
-            cmd_min=-link.joint.effort,
+            cmd_max=link.joint.limit["effort"],
+            cmd_min=-link.joint.limit["effort"],
         )
 
 
@@ -400,6 +403,10 @@ def _missing(robot: Robot, links: tuple[Link, ...]) -> list[tuple[object, str]]:
     """Properties that Gazebo lacks: for each, whether robot or world has it, and a description."""
     bed = near_bed(robot)
     return [
+        (
+            robot.edited_model is not None,
+            "masses and inertias of the edited model: links have those of the modules",
+        ),
         (True, "tilt at the surface: Gazebo cuts boxes as if they stood level"),
         (True, "the share of drag and added mass that is lost above the surface"),
         (

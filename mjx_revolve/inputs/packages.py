@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from importlib.metadata import PackageNotFoundError, version
 
 from mjx_revolve.inputs.errors import InputError
@@ -21,15 +22,24 @@ REQUIREMENTS = {
 
 
 def check_package(place: str, module: str) -> None:
-    """Raises `InputError` if a module that only an extra brings is missing.
+    """Raises `InputError` if a module that only an extra brings is missing, or too old.
 
     Args:
         place: what needs it.
         module: its name.
     """
+    needed = REQUIREMENTS.get(module, "")
+    cure = f"(pip install '{needed}')"
     if importlib.util.find_spec(module) is None:
-        missing = f"none (pip install '{REQUIREMENTS[module]}')"
-        raise InputError(place, f"the package {module}", missing)
+        raise InputError(place, f"the package {module}", f"none {cure}")
+    name, _, least = needed.partition(",")[0].partition(">=")
+    found = installed_version(name) if name else ""
+    if found and _numbers(found) < _numbers(least):
+        raise InputError(place, f"{name} {least} or newer", f"{found} {cure}")
+
+
+def _numbers(text: str) -> list[int]:
+    return [int(x) for x in re.findall(r"\d+", text)]
 
 
 def check_mujoco() -> None:

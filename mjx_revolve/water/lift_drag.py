@@ -294,7 +294,7 @@ LIFT_DRAG = PartDragLaw(
     mjcf=Export("inertia_box", FACES.mjcf.note, missing="fins: their lift and stall are left out"),
     sdf=Export(
         "lift_drag",
-        note="LiftDrag lifts and drags the fins",
+        note="LiftDrag lifts and drags the fins, Hydrodynamics brakes their turning",
         missing="the current at the fins: Gazebo's LiftDrag has the wind only",
     ),
 )

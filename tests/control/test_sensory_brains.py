@@ -234,6 +234,20 @@ def test_oscillators_settle_at_their_lags_and_answer_to_sensors():
     assert crossings == pytest.approx(2 * 1.5 * 2, abs=1)
 
 
+def test_phases_of_hours_lose_whole_turns():
+    plant = plant_of(elbow_robot(world()))
+    controller = make_sensory_cpg(plant, [Sensor(type="climb")])
+    parameters = controller.decode(jnp.asarray(drawn(controller)), plant)
+    quiet = SensorReadings(np.zeros(1), np.zeros(1), (), ())
+    samples, (phase, swing), offset = controller.init(parameters)
+    found = []
+    for turns in (0, 2000):
+        begun = samples, (phase + 2 * np.pi * turns, swing), offset
+        found.append(controller.step(parameters, begun, jnp.asarray(1.0), quiet)[0][1][0])
+    np.testing.assert_allclose(*found, atol=3e-3)
+    assert np.abs(found[0]).min() > 0
+
+
 def test_splines_go_through_their_points():
     robot = elbow_robot(world())
     plant = plant_of(robot)

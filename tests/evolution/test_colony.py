@@ -30,7 +30,7 @@ from mjx_revolve.evolution.colony import (
     wrap_edges,
 )
 from mjx_revolve.evolution.colony_search import ColonyEvolution
-from mjx_revolve.evolution.executor import make_executor
+from mjx_revolve.evolution.executor import Executor, make_executor
 from mjx_revolve.evolution.generations import run_generations
 from mjx_revolve.evolution.reproduction import make_founder
 from mjx_revolve.inputs.errors import InputError
@@ -118,6 +118,10 @@ def test_mating(fitness, rules):
     promised = (PendingBirth(99.0, mated.pending_births[0].parents),) * 3
     full = replace(colony, pending_births=promised)
     assert mate(full, trajectory, rules)[0].pending_births == full.pending_births
+    # One beyond the edge meets whom it touches there, not whom it will be put beside.
+    for x, met in ((1.2, [(0, 1)]), (-1.2, [])):
+        beside = stand(fitness, [(1.3, 0, -1), (x, 0, -1)], [0.2, 0.1])
+        assert parents(mate(*beside, rules)[0]) == met
 
 
 def test_deaths(fitness, rules):
@@ -197,6 +201,16 @@ def test_founders_are_seeds_their_mutants_and_random_ones():
     found, _ = found_colony(Colony(), 0.0, rules, np.random.default_rng(0))
     origins = [one.origin for one in found.living]
     assert origins == ["seed spider", *["mutant of spider"] * 2, "random", "random"]
+
+
+def test_the_noise_of_sensors_follows_from_the_seed(fitness):
+    def noise(seed):
+        config = make_config(COLONY | {"evolution": COLONY["evolution"] | {"seed": seed}}, ROOT)
+        evolution = ColonyEvolution(config, Executor(fitness, fitness.block_size))
+        evolution.ask(evolution.start())
+        return set(evolution.tank.to_arrays()["noise"][evolution.tank.alive].tolist())
+
+    assert noise(3) == noise(3) and len(noise(3)) > 1 and not noise(3) & noise(4)
 
 
 @pytest.fixture(scope="module")

@@ -480,14 +480,21 @@ def test_the_node_gives_the_brains_commands(tmp_path, monkeypatch):
     # The core turned by 120° about (1, 1, 1).
     turn = types.SimpleNamespace(w=0.5, x=0.5, y=0.5, z=0.5)
     spin, force = (0.1, -0.2, 0.3), (1.0, 2.0, 9.0)
-    node.heard["/imu"][1](_Message(orientation=turn, angular_velocity=_xyz(spin),
-                                   linear_acceleration=_xyz(force)))  # fmt: skip
+    known = [0.0] * 9
+    imu = {"orientation": turn, "angular_velocity": _xyz(spin), "linear_acceleration": _xyz(force)}
+    node.heard["/imu"][1](_Message(**imu, **{f"{name}_covariance": known for name in imu}))
+    # What is not estimated, and what is no number, leaves what is known.
+    blank = dict.fromkeys(imu, types.SimpleNamespace(w=1.0, x=0.0, y=0.0, z=0.0))
+    none = {f"{name}_covariance": [-1.0, *known[1:]] for name in imu}
+    node.heard["/imu"][1](_Message(**blank, **none))
     node.heard["/sensors/flow"][1](_Message(data=[0.4, 0.5, 0.6]))
+    node.heard["/sensors/flow"][1](_Message(data=[0.4, np.nan, 0.6]))
     joints = node.heard["/joint_states"][1]
     joints(_Message(name=["arm_1_2"], position=[0.2], velocity=[-1.0], effort=[0.05]))
     tick()
     assert node.said["/joint_targets"] == []  # a joint is missing
     joints(_Message(name=["other", "arm_1"], position=[9, 0.1], velocity=[9, 2.0], effort=[9, 0.0]))
+    joints(_Message(name=["arm_1"], position=[0.1], velocity=[np.nan], effort=[np.nan]))
     matrix = Rotation.from_quat([0.5, 0.5, 0.5, 0.5]).as_matrix()
     given = {"up": matrix[2], "north": matrix[0], "angular_velocity": spin, "force": force,
              "flow": [0.4, 0.5, 0.6], "angle": [0.1, 0.2], "speed": [2.0, -1.0],

@@ -1,5 +1,6 @@
 """Links and their names; MJCF and URDF as MuJoCo and yourdfpy read them."""
 
+import copy
 from xml.etree import ElementTree
 
 import mujoco
@@ -12,6 +13,8 @@ from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.formats.export import export_robot
 from mjx_revolve.formats.links import make_links, rest_pose
 from mjx_revolve.formats.mjcf import make_mjcf
+from mjx_revolve.formats.sdf import make_sdf
+from mjx_revolve.formats.urdf import make_urdf
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.world import load_world
 
@@ -124,6 +127,19 @@ def test_mjcf_has_the_current_and_a_near_bed():
     mujoco.mj_resetDataKeyframe(model, data, 0)
     mujoco.mj_forward(model, data)
     assert data.ncon > 0  # half a core is 22.5 mm
+
+
+def test_what_an_edited_model_does_not_limit_is_not_limited():
+    robot = lake_robot("spider")
+    edit = copy.copy(robot.mj_model)
+    edit.actuator_forcelimited[0] = edit.jnt_limited[1] = 0
+    edit.actuator_forcerange[0], edit.jnt_user[1, 0] = 0, np.inf
+    free = robot.with_model(edit)
+    limit = ElementTree.fromstring(make_urdf(free)).find("joint/limit")
+    found = {name: float(x) for name, x in limit.items()}
+    assert found == {"lower": -1e16, "upper": 1e16, "effort": 1e16, "velocity": 1e16}
+    text = make_sdf(free)
+    assert "<cmd_max>1e+16</cmd_max>" in text and "of the edited model" in text
 
 
 @pytest.mark.parametrize("drag", ["off", "ellipsoid", "inertia_box"])

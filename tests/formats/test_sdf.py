@@ -144,6 +144,9 @@ def test_sdf_has_the_water_of_each_part(robot):
             if DRAG_LAWS[table.drag[k]].sdf.stand_in == "lift_drag":
                 assert float(fins[part.name].findtext("area")) == pytest.approx(plates.area[k])
                 assert float(fins[part.name].findtext("air_density")) == density
+                tags = "kPabsP", "mQabsQ", "nRabsR"
+                turning = [float(drags[part.name].findtext(tag)) for tag in tags]
+                np.testing.assert_allclose(turning, -plates.angular[k], rtol=1e-9)
                 continue
             # After Fossen: what brakes is negative.
             found = [

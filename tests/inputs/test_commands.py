@@ -131,6 +131,15 @@ def test_a_missing_package_is_named_with_its_remedy(module, monkeypatch):
     assert refusal(check_package, "here", module) == expected
 
 
+def test_a_package_that_is_too_old_is_named(monkeypatch):
+    of_mujoco(monkeypatch, json="1.2.9")
+    monkeypatch.setitem(REQUIREMENTS, "json", "json>=1.10,<2")
+    expected = "here: expected json 1.10 or newer; found 1.2.9 (pip install 'json>=1.10,<2')"
+    assert refusal(check_package, "here", "json") == expected
+    of_mujoco(monkeypatch, json="1.10.0")
+    check_package("here", "json")
+
+
 def of_mujoco(monkeypatch, **found):
     def version(name):
         if name not in found:
