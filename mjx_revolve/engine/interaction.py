@@ -149,12 +149,12 @@ def penalty_force(
     slip = tuple(v + inwards * n for v, n in zip(velocity, normal, strict=True))
     grip = parameters.friction * force / jnp.sqrt(dot(slip, slip) + CREEP_SPEED**2)
     change = tuple(-grip * s - f for s, f in zip(slip, friction, strict=True))
-    size = jnp.sqrt(dot(change, change))
-    _, pieces = inverse(vscale(1 / jnp.maximum(size, _TINY), change))
+    # The larger square, not the larger root: that of 0 has no derivative.
+    size = jnp.sqrt(jnp.maximum(dot(change, change), _TINY**2))
+    _, pieces = inverse(vscale(1 / size, change))
     friction = vadd(friction, vscale(1 / (1 + dt * grip * pieces), change))
-    size = jnp.sqrt(dot(friction, friction))
-    bound = parameters.friction * force / jnp.maximum(size, _TINY)
-    return force, vscale(jnp.minimum(bound, 1), friction)
+    size = jnp.sqrt(jnp.maximum(dot(friction, friction), _TINY**2))
+    return force, vscale(jnp.minimum(parameters.friction * force / size, 1), friction)
 
 
 class _Side(NamedTuple):
@@ -403,7 +403,9 @@ def make_interaction(
         The functions. There are loops of unknown length in them: they have forward derivatives
         only.
     """
-    found = None if contact is None else _Contact(trees, spheres, present, worlds, contact)
+    found = None
+    if contact is not None and len(spheres.radius):  # robots that touch nothing have none
+        found = _Contact(trees, spheres, present, worlds, contact)
 
     def detect(state: State, neighbours: Any) -> tuple[InteractionForces, Any]:
         wrench: Any = ()
@@ -490,11 +492,13 @@ class _Contact:
         """A new list; where it has no room, one of what may meet in this step, made at every one.
 
         And where that has none, of what touches. `ahead` is the way by which two spheres may near
-        each other in the step [m].
+        each other in the step [m]; where it is more than the skin, the list looks as far.
         """
-        place, near, close = self._balls(frames)
-        usual = jnp.asarray(_SKIN, ahead.dtype)
-        skins = jnp.stack([usual, jnp.minimum(ahead, usual), jnp.zeros_like(usual)])
+        # No farther than to robots that count as close: what blows up needs no list of all.
+        usual = jnp.clip(ahead, _SKIN, _ROBOT_SKIN)
+        place, near, close = self._balls(frames, usual)
+        # Never less than the skin finds.
+        skins = jnp.stack([usual, jnp.minimum(ahead, _SKIN), jnp.zeros_like(usual)])
 
         def attempt(carry: Any) -> Any:
             count, _, found = carry
@@ -506,8 +510,10 @@ class _Contact:
         moved = jnp.where(count == 1, 0, jnp.inf).astype(ahead.dtype)
         return found._replace(close=close, moved=moved, strayed=moved)
 
-    def _balls(self, frames: Frames) -> tuple[Vec, jax.Array, jax.Array]:
+    def _balls(self, frames: Frames, skin: jax.Array) -> tuple[Vec, jax.Array, jax.Array]:
         """Positions of all spheres, pairs of robots that may touch, and robots with others close.
+
+        Pairs of robots are those within a `skin` of each other.
 
         Returns:
             `[S, lanes]` each, `[worlds, n, n]` and `[lanes]`.
@@ -525,7 +531,7 @@ class _Contact:
         square, reach = squared_distances(middle, self.worlds, self.present), reach.reshape(-1, n)
         both = reach[:, :, None] + reach[:, None, :]
         close = jnp.any(square < (both + _ROBOT_SKIN) ** 2, 1).reshape(-1)
-        return place, square < (both + _SKIN) ** 2, close
+        return place, square < (both + skin) ** 2, close
 
     def _spheres(
         self,

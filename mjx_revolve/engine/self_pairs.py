@@ -27,9 +27,10 @@ _RANGE_MARGIN, _CLEARANCE = 0.02, 1e-3
 # milliseconds; with five times fewer, twice as many pairs of long random bodies stay undecided, and
 # are looked at in every step.
 _SHARE, _BUDGET = 2048, 40000
-# Angles from rest to the end of a hinge's range at which neighbours are compared, and how often the
-# interval in which they meet is divided so again. Choices: steps of 2 degrees, then 0.003.
-_ANGLES, _PASSES = 24, 3
+# From rest to the end of a hinge's range, an eighth of a turn after the other and a whole one at
+# most: angles in each at which neighbours are compared, and how often the interval in which they
+# meet is divided so again. Choices: steps of 2 degrees, then 0.003.
+_SPAN, _SPANS, _ANGLES, _PASSES = np.pi / 4, 8, 24, 3
 
 
 def candidate_pairs(assembly: Assembly) -> Int[np.ndarray, "pairs 2"]:
@@ -137,9 +138,9 @@ def meeting_pairs(assembly: Assembly) -> Int[np.ndarray, "pairs 2"]:
     Of `candidate_pairs` those are left out that stay apart at all angles: by branch and bound over
     the hinges on the way from one part to the other. When hinge k turns by δ, one of the parts
     moves by at most δ times the distance of its farthest point from the hinge's axis; so, in a box
-    of angles, the gap is at least that in its middle, less the sum of these over half the box's
-    edges. Boxes of angles in which that leaves a gap are done; others are halved. A pair is kept
-    when it overlaps in the middle of a box, or when its share of the work is used up.
+    of angles, the gap is at least that in its middle, less a sum of these over half the box's
+    edges (`_nearing`). Boxes of angles in which that leaves a gap are done; others are halved. A
+    pair is kept when it overlaps in the middle of a box, or when its share of the work is used up.
 
     Args:
         assembly: of one robot.
@@ -155,6 +156,7 @@ def meeting_pairs(assembly: Assembly) -> Int[np.ndarray, "pairs 2"]:
     middle, half = (low + high) / 2, (high - low) / 2 + _RANGE_MARGIN
     own = table.body[pairs]
     way = (above[own[:, 0]] ^ above[own[:, 1]]).T
+    first_side = above[own[:, 0]].T & way
     kept, spent, budget = np.zeros(len(pairs), bool), np.zeros(len(pairs), int), _BUDGET
     which = np.arange(len(pairs))
     # In single precision: errs by less than a thousandth of the clearance, and is faster.
@@ -172,7 +174,7 @@ def meeting_pairs(assembly: Assembly) -> Int[np.ndarray, "pairs 2"]:
         which, center, edge = which[stay], center[:, stay], edge[:, stay]
         position, rotation = _poses(assembly, center)
         spin = matvec(rotation, axis[..., None])
-        row, shapes, reach = np.arange(len(which)), [], np.full_like(center, np.inf)
+        row, shapes, reaches = np.arange(len(which)), [], []
         for part in pairs[which].T:
             body = table.body[part]
             turn = rotation[:, :, body, row]
@@ -181,12 +183,13 @@ def meeting_pairs(assembly: Assembly) -> Int[np.ndarray, "pairs 2"]:
             arm = origin[:, None] - position
             # The arm's length across the unit axis.
             across = np.maximum(dot(arm, arm) - dot(spin, arm) ** 2, 0)
-            reach = np.minimum(reach, np.sqrt(across) + radius[part])
+            reaches.append(np.sqrt(across) + radius[part])
         (one, first, half_one), (other, second, half_other) = shapes
         gap = box_gap(BoxPair(other - one, first, second, half_one, half_other))
-        moves = edge * reach
+        moves = edge * np.minimum(*reaches)
         kept[which[gap < 0]] = True
-        stay = (gap - moves.sum(0) < _CLEARANCE) & ~kept[which]
+        nearing = _nearing(edge, reaches, first_side[:, which])
+        stay = (gap - nearing < _CLEARANCE) & ~kept[which]
         which, center, edge, moves = which[stay], center[:, stay], edge[:, stay], moves[:, stay]
         row, aside = np.arange(len(which)), np.zeros_like(edge)
         widest = moves.argmax(0) if len(which) else row
@@ -195,6 +198,21 @@ def meeting_pairs(assembly: Assembly) -> Int[np.ndarray, "pairs 2"]:
         which, edge = np.tile(which, 2), np.tile(edge, 2)
         center = np.concatenate([center - aside, center + aside], 1)
     return pairs[kept]
+
+
+def _nearing(edge: np.ndarray, reaches: list[np.ndarray], first_side: np.ndarray) -> np.ndarray:
+    """`[n]` by how much parts of pairs can near each other within half edges of angles [m].
+
+    The reach of one part counts for the hinges next to it, that of the other for those beyond:
+    turned one after the other, from where the two meet outwards, all between a hinge and the part
+    that its turn is said to move is still as in the middle. Of all such divisions, the least sum.
+    """
+    one, other = (edge * reach for reach in reaches)
+    less = one - other
+    # Along the way: up from the first part, bodies in falling order, then down to the second.
+    up = np.cumsum(np.where(first_side, less, 0)[::-1], 0)
+    down = up[-1] + np.cumsum(np.where(first_side, 0, less), 0)
+    return other.sum(0) + np.minimum(np.minimum(up.min(0), down.min(0)), 0)
 
 
 def hinge_stops(assembly: Assembly) -> Float[np.ndarray, "nbody 2"]:
@@ -253,7 +271,17 @@ def hinge_stops(assembly: Assembly) -> Float[np.ndarray, "nbody 2"]:
     allowed = np.where(rest > _TOUCH, -1e-6, np.minimum(rest, 0) - _DEEPER)
     share = np.arange(1, _ANGLES + 1)[:, None] / _ANGLES
     for side, nearest in enumerate((np.maximum, np.minimum)):
-        free, width, some = np.zeros(len(pairs)), stops[hinge, side], every
+        end, free = stops[hinge, side], np.zeros(len(pairs))
+        some, meeting = every, every[:0]
+        for _ in range(_SPANS):
+            width = np.clip(end - free, -_SPAN, _SPAN)
+            met = (gap(free[some] + share * width[some], some) < allowed[some]).any(0)
+            meeting = np.append(meeting, some[met])
+            some = some[~met]
+            free[some] += width[some]
+            some = some[free[some] != end[some]]
+        free[some] = end[some]  # nothing is in the way in a whole turn
+        some = meeting
         for _ in range(_PASSES):
             hit = gap(free[some] + share * width[some], some) < allowed[some]
             met = hit.any(0)
