@@ -116,7 +116,7 @@ def energy_balance(
     water = jax.tree.map(lambda x: jnp.asarray(x)[1:] if jnp.ndim(x) else x, water)
 
     rows = (jnp.asarray(np.asarray(x).T) for x in (qpos, qvel, command, ctrl))
-    run = fuse(partial(_powers, tree), inline=True)
+    run = fuse(partial(_powers, tree), inline=True, calls=False)
     found = jit(run, fast=True)(*rows, water, variation)
     found = {name: np.asarray(x, float) for name, x in found.items()}
     kinetic = float(found.pop("kinetic_after")[-1] - found.pop("kinetic_before")[0])

@@ -67,8 +67,9 @@ _VIEWS = {
 _COST |= dict.fromkeys(_VIEWS, 0)
 _LOOPS = {"cond", "scan", "while"}
 
-# Whether a function is traced that is fused as a whole.
+# Whether a function is traced that is fused as a whole, and that has no calls.
 _fusing: ContextVar[bool] = ContextVar("_fusing", default=False)
+_without_calls: ContextVar[bool] = ContextVar("_without_calls", default=False)
 
 Ts = TypeVarTuple("Ts")
 R = TypeVar("R")
@@ -143,19 +144,25 @@ def materialize(x: jax.Array) -> jax.Array:
     return materialize_p.bind(x) if fuses() else x
 
 
-def fuse(fun: Callable[[*Ts], R], inline: bool = False) -> Callable[[*Ts], R]:
+def fuse(fun: Callable[[*Ts], R], inline: bool = False, calls: bool = True) -> Callable[[*Ts], R]:
     """The same function, with each intermediate value computed once by XLA.
 
     Args:
         fun: a function of pytrees of arrays; element-wise but for loops, unless `inline`.
         inline: compile it into its caller instead of into a function of its own.
+        calls: whether functions that are fused within it become calls of their own. Where lanes are
+            many, dispatching kernels costs nothing, and without calls XLA cannot abort over one.
 
     Returns:
         The same function.
     """
 
     def shared(*args: *Ts) -> R:
-        return Graph(fun, args)(*args) if fuses() else fun(*args)
+        before = _without_calls.set(_without_calls.get() or not calls)
+        try:
+            return Graph(fun, args)(*args) if fuses() else fun(*args)
+        finally:
+            _without_calls.reset(before)
 
     return shared if inline else fuse_call(shared)
 
@@ -195,7 +202,7 @@ def fuse_call(fun: Callable[[*Ts], R]) -> Callable[[*Ts], R]:
             jax.jit(fun)(*args),
         )
 
-    return called if fuses() else fun
+    return called if fuses() and not _without_calls.get() else fun
 
 
 class _Operation(NamedTuple):
