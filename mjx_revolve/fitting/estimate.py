@@ -334,11 +334,10 @@ def begin(problem: FitProblem, seed: int) -> FitState:
     else:
         best = points[int(np.argmin(costs.sum(1)))]
     first = FitState(best, noise, none)
-    if (problem.short == problem.drive.resets).all():
-        return first
     pieces = problem.in_pieces()
     if "clock" not in problem.local:
-        return _arrive(pieces, first)
+        same = bool((problem.short == problem.drive.resets).all())
+        return first if same else _arrive(pieces, first)
     # A search finds a delay only from near it.
     arrived, clock = [], problem.local.index("clock")
     for late in _CLOCKS:

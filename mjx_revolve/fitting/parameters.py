@@ -16,7 +16,8 @@ import numpy as np
 from mjx_revolve.body.coefficients import ALL, correct_modules, merge_params
 from mjx_revolve.body.module_types import ModuleType
 from mjx_revolve.body.morphology import Morphology
-from mjx_revolve.body.params import MODULE_FACTORS
+from mjx_revolve.body.params import MODULE_FACTORS, apply_overrides
+from mjx_revolve.body.placement import Module
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.water.law_names import factor_names
@@ -185,6 +186,12 @@ def _check_present(text: str, key: str, kinds: Mapping[str, ModuleType], robot: 
         )
 
 
+def _before_thrust(module: Module) -> ModuleType:
+    """A module's type with its thruster's numbers, before its thrust and factors."""
+    own = {key: x for key, x in module.params.items() if key == "thruster"}
+    return apply_overrides(module.base or module.kind, own)
+
+
 def _plain_value(
     text: str, name: str, kinds: Mapping[str, ModuleType], body: Morphology
 ) -> Parameter | None:
@@ -216,10 +223,17 @@ def _plain_value(
             if len({getattr(jet, field) for jet in parts if jet is not None}) > 1:
                 raise InputError(f"--free {text}", f"thrusters alike in {module}", "several")
 
+        # The modules' own thrust and factors apply to what is put here, too.
+        bare = {
+            m.name: getattr(part.thruster, field)
+            for m in body.modules
+            if m.name in jets
+            for part in _before_thrust(m).parts
+            if part.thruster is not None
+        }
+
         def scaled(value: float) -> dict[str, Any]:
-            thrust = "thrust" if field.startswith("gain") else ""
-            found = {m: value * getattr(j, field) / own(m, thrust) for m, j in jets.items()}
-            return {m: {"thruster": {field: x}} for m, x in found.items()}
+            return {m: {"thruster": {field: value * x}} for m, x in bare.items()}
 
         return Parameter(text, "", 1.0, math.log(_THRUSTER[field]), True, scaled)
     if head not in ("ballast", "ballast_position"):

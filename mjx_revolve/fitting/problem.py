@@ -426,7 +426,7 @@ def make_problem(
     )
     drive = Drive(resets, angles, speeds, ctrl, later, begin)
     channels = [
-        _without(c, blind[:, r], begin[r], piece)
+        _without(c, recordings[r].name, blind[:, r], begin[r], piece)
         for r, v in enumerate(views)
         for c in v.channels(r, until[r], servos_free)
     ]
@@ -438,12 +438,15 @@ def make_problem(
     )  # fmt: skip
 
 
-def _without(channel: Channel, blind: np.ndarray, begin: float, piece: float) -> Channel:
-    """A channel without what was measured in windows `[K]` that are blind."""
+def _without(channel: Channel, name: str, blind: np.ndarray, begin: float, piece: float) -> Channel:
+    """A channel of a recording without what was measured in windows `[K]` that are blind."""
     window = np.ceil((channel.time - begin) / piece - 1e-9).astype(int) - 1
     none = blind[np.clip(window, 0, len(blind) - 1)]
     if not none.any():
         return channel
+    if none[1:].all() and channel.kind in ("position", "marks", "speed"):
+        expected = "measured angles where the robot is seen, or its attitude where they begin"
+        raise InputError(name, expected, "a gap in them, and nothing to fit")
     seen = np.where(none[:, None], np.nan, channel.seen) if len(channel.seen) else channel.seen
     residual = lambda s: np.where(none[:, None], np.nan, channel.residual(s))  # noqa: E731
     return channel._replace(seen=seen, residual=residual)
@@ -587,6 +590,15 @@ def _from_first_frame(recording: RobotRecording) -> RobotRecording:
     return replace(recording, signals=found)
 
 
+def _height_as_depth(recording: RobotRecording, surface: float) -> RobotRecording:
+    """The core's height beside marks is its depth: no pose of the core is fitted there."""
+    signals = dict(recording.signals)
+    if "x" in signals or "z" not in signals or not recording.marks:
+        return recording
+    time, height = signals.pop("z")
+    return replace(recording, signals={"depth": TimeSeries(time, surface - height)} | signals)
+
+
 def _interpolate_pose(time: np.ndarray, pose: np.ndarray, at: np.ndarray) -> np.ndarray:
     """`[T, 7]` poses of `[n, 7]`, of which the quaternion alone is known, NaN in its gaps."""
     found = np.full((len(at), 7), np.nan)
@@ -603,6 +615,7 @@ class _View:
 
     def __init__(self, robot: Robot, recording: RobotRecording, hinges: Sequence[str]) -> None:
         """Finds the core's poses."""
+        recording = _height_as_depth(recording, robot.world.surface_height)
         recording = _from_first_frame(recording)
         self.robot, self.recording, self.hinges = robot, recording, hinges
         signals = recording.signals

@@ -261,25 +261,25 @@ def _read_csv(
             raise InputError(f"expected columns with commas between them; found {words}")
     if len(rows) < 3:
         raise InputError(f"expected rows of numbers below the names; found {len(rows) - 1}")
+    named = _name_columns(header, columns, robot)
+    read = {k for k, _ in named.values()}
     values = np.full((len(rows) - 1, len(header)), np.nan)
     for k, row in enumerate(rows[1:]):
         if len(row) != len(header):
             raise InputError(f"row {lines[k + 1]}", f"{len(header)} cells", len(row))
         for j, cell in enumerate(row):
-            if cell.strip():
+            if j in read and cell.strip():
                 try:
                     values[k, j] = float(cell)
                 except ValueError:
                     raise InputError(
                         f"row {lines[k + 1]}, column {header[j]}", "a number", show(cell)
                     ) from None
-    named = _name_columns(header, columns, robot)
     if "time" not in named:
         raise InputError(
             f"expected a column time (--map time=COLUMN, or frame*0.0333); found "
             f"{', '.join(header)}"
         )
-    read = {k for k, _ in named.values()}
     unused = [name for k, name in enumerate(header) if k not in read]
     column, scale = named.pop("time")
     time = scale * values[:, column]

@@ -14,10 +14,10 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.fitting.estimate import FitState, Model, advance, begin, linearize
 from mjx_revolve.fitting.identify import Unknown, find_unknown, is_found, plan_motions
 from mjx_revolve.fitting.intervals import LEVEL, Estimate, estimate
-from mjx_revolve.fitting.parameters import entries_of, split_free, with_values
+from mjx_revolve.fitting.parameters import entries_of, with_values
 from mjx_revolve.fitting.problem import LOCAL_UNITS, FitProblem, FitSettings, make_problem
 from mjx_revolve.fitting.recording import RobotRecording, check_recording
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, plain
 from mjx_revolve.inputs.yaml_reader import dump_yaml
 
 
@@ -137,7 +137,7 @@ class Fit:
         lines += [f"# {u.words}." for u in self.unknown]
         if any(m.params.get("factors") for m in self.problem.robot.morphology.modules):
             lines.append("# On top of the factors that the robot had; robot.yaml has all of them.")
-        return "\n".join(lines) + "\n" + dump_yaml({"modules": self.coefficients})
+        return "\n".join(map(plain, lines)) + "\n" + dump_yaml({"modules": self.coefficients})
 
     def to_json(self) -> str:
         """All numbers, for other programs."""
@@ -239,9 +239,10 @@ def conclude(
     advice = ""
     plan = None
     if advise:
-        own, _ = split_free(free)
+        # A further motion has a current, too; a clock is of commands, which coasts lack.
+        sought = [name for name in free if name != "clock"]
         with contextlib.suppress(InputError):  # a motion that diverges: no advice, but the fit
-            plan = plan_motions(problem.robot, own, problem.settings, found.information, 1)
+            plan = plan_motions(problem.robot, sought, problem.settings, found.information, 1)
     if plan is not None:
         spread = np.array([p.spread for p in problem.parameters])
         now = np.sqrt(np.diag(found.covariance)) / spread

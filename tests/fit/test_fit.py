@@ -227,7 +227,6 @@ def test_an_attitude_beside_one_mark_counts(auv):
         assert [c.kind for c in problem.channels] == ["marks", "attitude"]
         yaw = Rotation.from_quat(problem.roots[:, 3:7, 0], scalar_first=True).as_rotvec()[:, 2]
         assert yaw == pytest.approx(0.3, abs=1e-6)
-        # The core is beside the mark.
         assert problem.roots[:, 1, 0] == pytest.approx(-0.1 * np.cos(0.3), abs=1e-6)
 
 
