@@ -78,7 +78,8 @@ NASTY: list[Any] = [
     Raw("{? {a: 1} : 3}"), Raw("{a: 1, a: 2}"), Raw("{.nan: 1, .nan: 2}"), Raw("{1: 1, true: 2}"),
     Raw("[" * 300 + "]" * 300), Raw("{a: " * 300 + "}" * 300), Raw("[" * 2000), Raw(_BOMB + "]"),
     Raw("!!omap " + _BOMB.replace("[&a", "[a: &a").replace(", &", ", b: &") + "]"),
-    Raw("|\n x"), Raw("%YAML 9.9"), Raw("---\na"), Raw("\t"), Raw("\0"), Raw("@"), Raw("`"),
+    Raw("|\n x"), Raw("%YAML 9.9"), Raw("%YAML 1." + "1" * 5000), Raw(r'"\U00110000"'),
+    Raw(r'"\Uffffffff"'), Raw("---\na"), Raw("\t"), Raw("\0"), Raw("@"), Raw("`"),
 ]  # fmt: skip
 
 _ANY_TEXT = st.text(st.characters(exclude_categories=()), max_size=20)

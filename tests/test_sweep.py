@@ -140,6 +140,18 @@ def test_a_run_of_which_every_episode_fails_does_not_stop_the_others(folder, no_
 
 
 @pytest.mark.slow
+def test_a_robot_that_is_edited_meanwhile_is_in_no_run(folder, no_pictures, capsys):
+    class Edited(toys.Toy):
+        def evaluate(self, population, key):
+            (folder / "robot.yaml").write_text("id: another\n")
+            return super().evaluate(population, key)
+
+    assert run_sweep(*GRID[:3], *GRID[-2:], make_fitness=lambda config: Edited()) == 2
+    assert "seed_1: toy.yaml: expected configuration and files as" in capsys.readouterr().err
+    assert "finished" in RunFolder(folder / "out" / "toy" / "seed_0").info
+
+
+@pytest.mark.slow
 def test_ctrl_c_stops_after_the_generation_under_way(folder, capsys):
     class Pressed(toys.Toy):
         def evaluate(self, population, key):

@@ -270,6 +270,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
         if not path.is_file():  # a pipe would block
             raise DamageError("expected a file; found none")
         with zipfile.ZipFile(path) as file:
+            if any(entry.compress_type for entry in file.infolist()):
+                raise DamageError("expected plain arrays; found compressed ones")  # of any size
             broken = file.testzip()  # every checksum; np.load looks only at what it happens to read
         if broken:
             raise DamageError(f"{broken} is damaged")

@@ -132,10 +132,14 @@ class Run:
         check_tensorboard(config, config.source)
         if out:
             check_new_folder(out)  # before the expensive part
+        stamps = _stamps(config)
         place = Path(out) if out else _RUNS / "any"
         check_place(place / "any", f"--out {place}" if out else str(_RUNS))
         executor = _prepare(config, make_executor)
         check_search(config, executor)
+        if _stamps(config) != stamps:  # the copies would be of another robot than the fitness
+            whole = "files that stay as they are until the run has begun"
+            raise InputError(config.source, whole, "one that it names changed")
         info = {
             "started": timestamp(),
             "seed": config.evolution.seed,
@@ -520,6 +524,12 @@ def describe_host() -> dict[str, object]:
     return {key: info[key] for key in _HOST}
 
 
+def _stamps(config: Config) -> list[tuple[int, int]]:
+    """Values that change when a file that the configuration names is written."""
+    found = (Path(file.path).stat() for file in config.files)
+    return [(x.st_size, x.st_mtime_ns) for x in found]
+
+
 def timestamp() -> str:
     """Now, in ISO 8601 with the offset from UTC."""
     return datetime.datetime.now().astimezone().isoformat(timespec="seconds")
@@ -529,8 +539,10 @@ def claim_folder(name: str) -> Path:
     """A new folder below `runs/`, unique even if other runs begin at the same time."""
     stem = f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
     names = itertools.chain([stem], (f"{stem}-{n}" for n in itertools.count(2)))
+    with naming(_RUNS):
+        _RUNS.mkdir(parents=True, exist_ok=True)
     while True:
         folder = _RUNS / next(names)
         with naming(folder), contextlib.suppress(FileExistsError):
-            folder.mkdir(parents=True)
+            folder.mkdir()
             return folder

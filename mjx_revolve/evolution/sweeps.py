@@ -300,6 +300,11 @@ def run_plans(
         a file or no worker was left, 2 when a run could not begin, go on or be judged.
     """
     began, ran, code = time.perf_counter(), 0, 0
+    # A sweep may take days, and reads them anew for each run.
+    known: dict[str, tuple[object, str]] = {}
+    for plan, step in steps.items():
+        if step == "begin" and plan.case not in known:
+            known[plan.case] = _made_of(plan)
     left = sum(step != "finished" for step in steps.values())
     width = len(str(len(steps)))
     with Interrupts() as interrupts, contextlib.closing(SharedExecutor(make_executor)) as executors:
@@ -317,6 +322,9 @@ def run_plans(
             say(f"{begin}running ... ", end="")
             started = time.perf_counter()
             try:
+                if step == "begin" and _made_of(plan) != known[plan.case]:
+                    expected = "configuration and files as they were when the sweep started"
+                    raise InputError(short_path(plan.base), expected, "them changed")
                 champion = _run(plan, step, executors, draw, interrupts, number, trust)
             except (WorkerError, OSError) as error:
                 words = describe_refusal(error) if isinstance(error, OSError) else str(error)
@@ -377,6 +385,12 @@ def _run(
         words = "stopped" if champion is None else f"champion: {champion.score:.3g}"
         print(words, file=out)
         return champion
+
+
+def _made_of(plan: Plan) -> tuple[object, str]:
+    """What a run is made of but for its seed, files by what they hold."""
+    config = plan._replace(seed=0).config
+    return config.evolution, fitness_hash(config)
 
 
 def _changes(plan: Plan) -> list[str]:

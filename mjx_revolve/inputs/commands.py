@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import json
 import logging
 import math
@@ -251,6 +252,8 @@ def check_place(path: str | Path, label: str) -> None:
             return
         if folder.exists():
             raise InputError(label, f"the folder {folder}", "a file")
+        if folder.is_symlink():
+            raise InputError(label, f"the folder {folder}", "a link that leads nowhere")
 
 
 def check_output_folder(folder: str | Path, option: str = "--out") -> None:
@@ -292,7 +295,9 @@ def say(text: str, end: str = "\n") -> None:
     """Prints a line; if nothing reads standard output any more, a run goes on in silence."""
     try:
         print(text, end=end, flush=True)
-    except BrokenPipeError:
+    except OSError as error:
+        if error.errno not in (errno.EPIPE, errno.EIO):  # a pipe, a terminal
+            raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

@@ -123,6 +123,7 @@ def write_atomic(path: Path, content: bytes | Callable[[Path], None]) -> None:
     try:
         with naming(path):
             path.parent.mkdir(parents=True, exist_ok=True)
+            temporary.unlink(missing_ok=True)  # a link that a stranger has put there
             if callable(content):
                 content(temporary)
             else:

@@ -40,7 +40,7 @@ def read_overrides(overrides: Mapping[str, object] | Sequence[str]) -> tuple[dic
         try:
             # The same reader as for files, so that 1e-3 is a number here too.
             parsed[key] = yaml.load(text, Loader=SafeLoader)
-        except (yaml.YAMLError, ValueError, RecursionError) as error:
+        except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
             reason = getattr(error, "problem", None) or str(error).splitlines()[0]
             raise InputError(f"--set {key}: expected a YAML value; found: {reason}") from None
     return parsed, "--set"

@@ -169,6 +169,10 @@ def parse_yaml(content: bytes, path: str | Path) -> Any:
             return copy.deepcopy(_parse(text))
         except RecursionError:
             raise _too_deep() from None
+        except InputError:
+            raise
+        except (ValueError, OverflowError) as error:  # "\U00110000", %YAML 1.1111...
+            raise InputError(f"expected valid YAML; found: {error}") from None
         except yaml.YAMLError as error:
             mark = getattr(error, "problem_mark", None)
             place = f"line {mark.line + 1}: " if mark else ""

@@ -331,6 +331,8 @@ def source_hash() -> str:
     """
     digest = hashlib.sha256()
     paths = [*_PACKAGE.rglob("*.py"), *(_PACKAGE / "water" / "worlds").glob("*.yaml")]
+    # Not what editors and systems put beside them: `.#run.py`, `._run.py`.
+    paths = [path for path in paths if not path.name.startswith(".")]
     for name, path in sorted((path.relative_to(_PACKAGE).as_posix(), path) for path in paths):
         digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()[:12]

@@ -90,8 +90,7 @@ OTHERS = sorted(set(STRATEGY_NAMES) - {find_strategy(name) for name in QUICK})
 
 
 def test_all_of_evosax_is_known_without_it():
-    several_populations = {"SV_CMA_ES", "SV_Open_ES"}
-    assert set(STRATEGY_NAMES) == set(algorithms) - several_populations
+    assert set(STRATEGY_NAMES) == set(algorithms) - {"SV_CMA_ES", "SV_Open_ES"}
 
 
 @pytest.mark.slow

@@ -21,7 +21,8 @@ from mjx_revolve.episodes.config import OLDER_WORLD, load_config, make_config, o
 from mjx_revolve.episodes.fitness import make_fitness
 from mjx_revolve.evolution import run_folder as runs
 from mjx_revolve.evolution.fingerprints import settings_hash
-from mjx_revolve.evolution.run import _prepare, check_unchanged
+from mjx_revolve.evolution.run import _prepare, check_unchanged, claim_folder
+from mjx_revolve.inputs.commands import check_place
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.inputs.yaml_reader import load_yaml
 from mjx_revolve.water.world import load_world
@@ -183,6 +184,14 @@ def test_full_folder_is_refused(tmp_path, config):
         runs.create_run_folder(tmp_path / "run", config)
     with pytest.raises(InputError, match="expected a new or empty folder; found a file"):
         runs.check_new_folder(tmp_path / "robot.yaml")
+
+
+def test_runs_that_lead_nowhere_are_no_place_for_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").symlink_to("scratch")
+    check_refused("found a link that leads nowhere", check_place, "runs/a/b", "runs")
+    with pytest.raises(FileExistsError):
+        claim_folder("toy")
 
 
 def test_a_folder_whose_making_was_cut_short_is_a_new_one(tmp_path, run, config):
