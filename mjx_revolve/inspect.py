@@ -63,7 +63,7 @@ def main(argv: list[str] | None = None) -> int:
         if table:
             print("\n".join(map(plain, table)), end="\n\n")
     print("\n".join(summary(morphology, arguments.density, arguments.gravity)))
-    passport = Path(arguments.file).parent / "passport.yaml"
+    passport = Path(arguments.file).absolute().parent / "passport.yaml"
     in_run = passport.parent.name == "champion" and Path(arguments.file).is_file()
     if in_run and passport.is_file():
         from mjx_revolve.episodes.passport import load_passport

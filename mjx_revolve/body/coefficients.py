@@ -126,7 +126,8 @@ def merge_params(params: Mapping[str, Any], entry: Mapping[str, Any]) -> dict[st
         if old and new and new.get("curve", old.get("curve")) == old.get("curve"):
             found[key] = old | new
     if "coefficients" in found:
-        found["coefficients"] = {**params.get("coefficients", {}), **found["coefficients"]}
+        laws = {**params.get("coefficients", {}), **found["coefficients"]}
+        found |= check_overrides({"coefficients": laws}, "params")
     before, more = params.get("factors", {}), entry.get("factors", {})
     if before or more:
         both = {k: multiply_factors(x, before.get(k, 1.0)) for k, x in more.items()}

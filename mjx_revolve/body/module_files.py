@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 from annotated_types import MaxLen, MinLen
@@ -62,9 +62,12 @@ def read_modules(data: object, usual: Mapping[str, ModuleType]) -> dict[str, Mod
         InputError: something in it is wrong; the message says where.
     """
     kinds: dict[str, ModuleType] = {}
-    for name, item in read(_File, data).modules.items():
+    written = read(_File, data).modules
+    for name, item in written.items():
         place = f"modules.{name}"
-        kind = _read_type(name, item, usual, place)
+        # What is a type in this file is no alias of another one, nor of itself.
+        aliases = usual[name].aliases if name in usual else ()
+        kind = _read_type(name, item, [x for x in aliases if x not in written], place)
         for key in (kind.name, *kind.aliases):
             if key in kinds:
                 raise InputError(place, "each name and alias once", f"{key} twice")
@@ -72,7 +75,7 @@ def read_modules(data: object, usual: Mapping[str, ModuleType]) -> dict[str, Mod
     return kinds
 
 
-def _read_type(name: str, item: object, usual: Mapping[str, ModuleType], place: str) -> ModuleType:
+def _read_type(name: str, item: object, aliases: Sequence[str], place: str) -> ModuleType:
     written = read(_Written, item, place)
     parts = [_read_part(part, i, f"{place}.parts.{i}") for i, part in enumerate(written.parts)]
     holder = parts[0] if written.hinge is None else parts[-1]
@@ -80,7 +83,6 @@ def _read_type(name: str, item: object, usual: Mapping[str, ModuleType], place: 
         key: _read_slot(slot, holder, f"{place}.slots.{key}")
         for key, slot in (written.slots or {}).items()
     }
-    aliases = usual[name].aliases if name in usual else ()
     values = {
         "name": name,
         "parts": parts,

@@ -317,6 +317,8 @@ class ModuleType:
         whole = [part.fossen is not None and part.fossen.whole for part in self.parts]
         if any(whole[1:]) or (whole[0] and self.mount is not None):
             raise ConstraintError("parts", "fossen.whole in the first part of a core only", "more")
+        if self.mount is None and self.sensor:
+            raise ConstraintError("sensor", "false, as a core is part of a body's size", "true")
         if self.mount is None and self.mass <= 0.0:
             raise ConstraintError("mass", "a core heavier than 0 kg", f"{self.mass:g}")
         for k, sensor in enumerate(self.sensors):

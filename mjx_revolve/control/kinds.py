@@ -102,6 +102,11 @@ def _make_brain(plant: Plant, settings: Any, source: str, body: Morphology | Non
         return make_neural_network(plant, body, file)
     kind = brain.get("type") if isinstance(brain, Mapping) else brain
     if kind == "rlpower-splines":
+        # `settings.fastest` does not know what the file has.
+        if plant.rate is not None and settings.max_frequency > plant.rate / 2:
+            most = f"at most half of controller.rate ({plant.rate:g} Hz), to be sampled by it"
+            found = f"{settings.max_frequency:g}"
+            raise InputError(f"{source}: controller.max_frequency", most, found)
         return _make("splines", plant, settings)
     known = "neurons and connections, or type: rlpower-splines"
     if kind == "bo-cpg":

@@ -63,6 +63,9 @@ _OTHERWISE = {"amplitude": "gain"}
 _REACH = {"weight": 2.0, "bias": 1.0, "gain": 1.0, "phase_offset": 0.5, "amplitude": 1.0}
 _PERIODS = 4.0
 _CELLS, _INERTIAL = 2, 6  # inputs of a touch sensor, and of the core
+# Largest activity. In 32 bits a loop of Simple neurons would reach infinity within seconds, and 0
+# times that is NaN for all neurons; and a Sigmoid beyond this has the gradient 0 × infinity.
+_MOST = {"Simple": 1e30, "Sigmoid": 80.0}
 
 
 @checked
@@ -303,7 +306,7 @@ def make_neural_network(plant: Plant, body: Morphology, source: str = "robot") -
                 found.append(0.5 - amplitude / 2 + amplitude * (sine + 1) / 2)
             else:
                 bias, gain = table
-                own = gain * (own - bias)
+                own = jnp.clip(gain * (own - bias), -_MOST[kind], _MOST[kind])
                 found.append(own if kind == "Simple" else 1 / (1 + jnp.exp(-own)))
         if found:
             values = jnp.where(count != last, jnp.concatenate(found), values)

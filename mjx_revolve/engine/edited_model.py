@@ -85,7 +85,11 @@ def check_edit(model: mujoco.MjModel, built: mujoco.MjModel, name: str) -> None:
     if not np.all(speeds > 0):
         expected, found = "top speeds > 0, infinite for none", show(speeds.tolist())
         raise InputError(f"model of {name!r}: jnt_user", expected, found)
-    limits = {"jnt_range": "jnt_limited", "actuator_forcerange": "actuator_forcelimited"}
+    limits = {
+        "jnt_range": "jnt_limited",
+        "actuator_forcerange": "actuator_forcelimited",
+        "actuator_ctrlrange": "actuator_ctrllimited",
+    }
     for x, limited in limits.items():
         low, high = getattr(model, x)[getattr(model, limited).astype(bool)].T
         if not np.all(low < high):

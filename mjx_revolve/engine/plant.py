@@ -299,6 +299,10 @@ def plant_of(robot: Robot, order: Sequence[int] | None = None) -> Plant:
         Its table, `[n, 1]`.
     """
     body, (low, high, place, axis) = robot.morphology, read_actuators([robot.morphology])
+    if robot.edited_model is not None:  # without limits of commands, those as built
+        model, own = robot.edited_model, actuators_of(robot)
+        limited = model.actuator_ctrllimited[own].astype(bool)
+        low, high = np.where(limited, model.actuator_ctrlrange[own].T, (low, high))
     source = np.array(range(len(low)) if order is None else order, np.int32)
     row = np.argsort(source)
     names = (*(body.modules[k].name for k in body.hinges), *body.thruster_names)

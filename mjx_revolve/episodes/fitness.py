@@ -635,6 +635,8 @@ def make_mixed_fitness(
     _check_alike(config, examples)
     controller_settings = with_sensors(config)
     sites = dict.fromkeys(s.each for s in controller_settings.sensors or () if s.each is not None)
+    if config.controller.is_user_code:  # of which types it reads is known only when it is made
+        sites |= dict.fromkeys(kind.name for kind in read_modules(config).values())
     capacity = fit_capacity(shown, kinds, touches, hinges, rows, modules, tuple(sites))
     # As many as no other axis has, so that a controller that takes one for the other is noticed.
     example = jax.tree.map(jnp.asarray, pack_bodies([robots[0]] * 7, capacity)).plant

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import WATER, body, box_robot, march, random_states, world
+from laboratory import WATER, at_rest, body, box_robot, march, random_states, world
 from mjx_revolve.engine.contact import bed_contact, bed_plane
 from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.robot import build_robot
@@ -145,14 +145,12 @@ def test_the_force_that_is_felt_is_the_one_that_stops_a_fall(dt):
     """Its impulse is the change of momentum, and the weight's."""
     robot = build_robot(body("core"), world(gravity=G, bed=Bed(height=-1.0), timestep=dt))
     engine, still, weight = make_engine(robot), water_of(robot.world), G * robot.morphology.mass
-    qpos = np.array(robot.mj_model.qpos0)[:, None]
-    qpos[2] = -0.95
 
     def step(state, _):
         state, _ = engine.step(state, jnp.zeros((0, 1)), still)
         return state, (engine.contact_force(state, still)[0, 0], engine.root(state).velocity[2])
 
-    start = engine.init(jnp.asarray(qpos), jnp.zeros((6, 1)))
+    start = engine.init(*map(jnp.asarray, at_rest(robot, 1, -0.95)))
     _, (force, rise) = jax.lax.scan(step, start, length=round(0.4 / dt))
     assert rise.min() < -0.6 and abs(rise[-1]) < 1e-4
     assert dt * force.sum() == pytest.approx(0.4 * weight, rel=0.1)

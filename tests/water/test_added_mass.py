@@ -4,8 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from laboratory import accelerate, arm_robot, at_rest, body, box_robot, march, random_states, world
-from mjx_revolve.engine.robot import build_robot
+from laboratory import accelerate, arm_robot, at_rest, box_robot, march, random_states, world
 from mjx_revolve.water.added_mass import box_added_mass, lamb_coefficients
 from references import Lagrangian, each_lane
 
@@ -70,9 +69,11 @@ def test_conservation_over_a_rollout():
     assert drift[1] / drift[2] == pytest.approx(2.0, abs=0.4)
 
 
-def check_lagrange(robot, lanes, seed=0):
+@pytest.mark.slow
+def test_a_jointed_body_obeys_lagrange():
     """The step's accelerations against Lagrange's equations with carried water, all 6 + n."""
-    qpos, qvel = random_states(robot, lanes, seed=seed, speed=1.5)
+    robot = arm_robot(world(added_mass=True))
+    qpos, qvel = random_states(robot, 12, speed=1.5)
     servo = qpos[7:] + 0.02  # each servo pulls with a known part of its effort
     qacc = accelerate(robot, qpos, qvel, servo)
     lagrangian, model = Lagrangian(robot, RHO), robot.mj_model
@@ -84,13 +85,3 @@ def check_lagrange(robot, lanes, seed=0):
         # Differences over 10 µs leave about 1e-9 of the forces at work.
         scale = np.abs(lagrangian.inertia(q)).max() * np.abs(a).max()
         assert needed == pytest.approx(expected, abs=1e-7 * scale)
-
-
-@pytest.mark.slow
-def test_a_jointed_body_obeys_lagrange():
-    check_lagrange(arm_robot(world(added_mass=True)), 12)
-
-
-@pytest.mark.slow
-def test_a_shipped_body_obeys_lagrange():
-    check_lagrange(build_robot(body("spider"), world(added_mass=True)), 4)
