@@ -119,12 +119,7 @@ def edited_assembly(assembly: Assembly, model: mujoco.MjModel, servos: Sequence[
         damping=filled(assembly.damping, model.dof_damping[dof]),
         stiffness=filled(assembly.stiffness, -model.actuator_biasprm[act, 1]),
     )
-    edited = edited.with_split_springs(filled(np.zeros(len(reach)), model.dof_armature[dof]))
-    # What a hinge without limits carries may meet others anywhere in a turn.
-    stops = edited.stops.copy()
-    stops[2:] = np.where(limited, stops[2:], [-np.pi, np.pi])
-    edited.__dict__["stops"] = stops
-    return edited
+    return edited.with_split_springs(filled(np.zeros(len(reach)), model.dof_armature[dof]))
 
 
 def _servos_of(model: mujoco.MjModel, servos: Sequence[int]) -> np.ndarray:

@@ -209,8 +209,6 @@ def test_modules_that_meet_in_an_edited_range_are_found():
     edit = copy.copy(robot.mj_model)
     edit.jnt_range[1:] = [-2.6, 2.6]
     wide = robot.with_model(edit).assembly
-    edit.jnt_limited[1:] = 0
-    assert len(robot.with_model(edit).assembly.meeting_pairs) >= len(wide.meeting_pairs)
     assert len(robot.assembly.meeting_pairs) == 0 < len(wide.meeting_pairs)
     assert wide.stops[2:].max() < 1.8 < wide.range[2:].max()
 
