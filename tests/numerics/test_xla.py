@@ -51,6 +51,12 @@ def plain(x):
     return carry, jnp.stack(kept)
 
 
+@pytest.mark.parametrize("calls", [True, False])
+def test_without_calls_there_are_none_to_abort_over(calls):
+    whole = fuse(lambda x: jax.lax.cond(x[0] > 0, fuse(step), step, x), inline=True, calls=calls)
+    assert ("xla_cpu_small_call" in jax.jit(whole).lower(LANES).as_text()) == calls
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("pieces", [1, 2, 5])
 def test_they_change_nothing(monkeypatch, pieces):

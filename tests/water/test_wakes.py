@@ -1,8 +1,5 @@
 """Laws that remember: plates that swing, fins whose lift lags behind their angle."""
 
-import tempfile
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,10 +7,12 @@ import pytest
 import scipy.special
 
 from laboratory import at_rest, batch_engine, box_robot, march, read, world
-from mjx_revolve.body.catalogue import MODULES, load_modules
+from mjx_revolve.body.catalogue import MODULES
+from mjx_revolve.body.module_files import read_modules
 from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.engine.batch import fit_capacity
 from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.inputs.yaml_reader import parse_yaml
 from mjx_revolve.numerics.spatial import dot
 from mjx_revolve.water.cross_flow import CROSS_FLOW
 from mjx_revolve.water.fin_wake import FIN_WAKE
@@ -29,10 +28,7 @@ pytestmark = pytest.mark.usefixtures("float64")
 
 def modules(text):
     """Module types from text, beside the catalogue's."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "modules.yaml"
-        path.write_text(text)
-        return MODULES | load_modules(path)
+    return MODULES | read_modules(parse_yaml(text.encode(), "modules.yaml"), MODULES)
 
 
 def numbers_of(law, robot, part=0):
