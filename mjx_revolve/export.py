@@ -43,6 +43,8 @@ _FORMATS = {
     ),
     "build": ("build.html", PAGES, "how to build it: parts, ballast, assembly, joints, STL"),
 }  # fmt: skip
+# Options, and the formats on which they have an effect.
+_USED_BY = {"meshes": ("urdf", "sdf"), "seed": ("mjcf", "sdf", "mcap"), "duration": ("mcap",)}
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -99,6 +101,16 @@ def _check_importable(path: Path, label: str) -> None:
         raise InputError(label, wanted, repr(path.stem))
 
 
+def _check_used(arguments: argparse.Namespace, files: dict[str, Path]) -> None:
+    """Refuses what has no effect on the files that options name, and a folder without its end."""
+    for option, formats in _USED_BY.items():
+        if files and getattr(arguments, option) is not None and files.keys().isdisjoint(formats):
+            wanted = ", ".join(f"--{name}" for name in formats)
+            raise InputError(f"--{option}", f"{wanted} or all formats", "neither")
+    if arguments.meshes and not arguments.meshes.endswith("/"):
+        raise InputError("--meshes", "a prefix that ends in /", repr(arguments.meshes))
+
+
 def main(argv: list[str] | None = None) -> int:
     """Writes a champion, or a morphology, for other programs.
 
@@ -114,8 +126,7 @@ def main(argv: list[str] | None = None) -> int:
     """
     arguments = _parser().parse_args(argv)
     files = _named_files(arguments)
-    if files and arguments.meshes is not None and files.keys().isdisjoint(("urdf", "sdf")):
-        raise InputError("--meshes", "--urdf, --sdf or all formats", "neither")
+    _check_used(arguments, files)
     if not files and Path(arguments.path).is_dir():
         check_place(Path(arguments.path) / "any", arguments.path)
     check_episode_path(arguments.path)

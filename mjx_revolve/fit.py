@@ -12,6 +12,8 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +34,7 @@ from mjx_revolve.inputs.trust import add_trust_argument, opening
 from mjx_revolve.numerics import runtime
 
 if TYPE_CHECKING:
+    from mjx_revolve.fitting.recording import RobotRecording
     from mjx_revolve.fitting.result import Fit
     from mjx_revolve.fitting.run import FitRun
 
@@ -107,6 +110,10 @@ def main(argv: list[str] | None = None) -> int:
     for name in arguments.recordings:  # before JAX is imported
         if not check_path(name).exists():
             raise InputError(name, "a CSV, an MCAP, a ROS 2 bag or a run folder", "none")
+    places = [check_path(name).resolve() for name in arguments.recordings]
+    for k, name in enumerate(arguments.recordings):
+        if places[k] in places[:k]:  # it would count twice, and be held out from itself
+            raise InputError(name, "each recording once", "it twice")
     with Interrupts() as interrupts:
         runtime.prepare_process()
         maps = [x for x in arguments.columns if "=" not in x]
@@ -116,6 +123,17 @@ def main(argv: list[str] | None = None) -> int:
             if arguments.plan:
                 return _plan(arguments)
             return _fit(arguments, interrupts)
+
+
+def _with_own_names(
+    recordings: Sequence[RobotRecording], paths: Sequence[str]
+) -> tuple[RobotRecording, ...]:
+    """Recordings with names of their own: files of one name in several folders with the paths."""
+    names = [recording.name for recording in recordings]
+    return tuple(
+        replace(one, name=short_path(path)) if names.count(one.name) > 1 else one
+        for one, path in zip(recordings, paths, strict=True)
+    )
 
 
 def _free(text: str) -> list[str]:
@@ -138,7 +156,8 @@ def _fit(arguments: argparse.Namespace, interrupts: Interrupts) -> int:
         )
         columns = read_map(arguments.columns)
         print(plain(f"loading {', '.join(arguments.recordings)}"), flush=True)
-        recordings = tuple(load_recording(path, robot, columns) for path in arguments.recordings)
+        read = [load_recording(path, robot, columns) for path in arguments.recordings]
+        recordings = _with_own_names(read, arguments.recordings)
         for recording in recordings:
             for note in recording.notes:
                 print(plain(f"note: {recording.name}: {note}"))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +18,7 @@ from jaxtyping import PyTree
 
 from mjx_revolve.control.courses import Course
 from mjx_revolve.control.pursuit import Pursuer, PursuitLimits, init_pursuer, step_pursuer
-from mjx_revolve.engine.engines import Engine
+from mjx_revolve.engine.engine import Engine
 from mjx_revolve.engine.interaction import NO_NEIGHBOUR, InteractionForces
 from mjx_revolve.engine.plant import Plant
 from mjx_revolve.engine.sites import Sites
@@ -434,43 +435,27 @@ def _motion_to_keep(motion: BodyMotion) -> PreviousMotion:
     return PreviousMotion(matvec(body, motion.velocity), motion.angular_velocity)
 
 
-class _RestingEngine:
-    """The functions of an `Engine` that readings call, for robots at rest: gives shapes."""
-
-    def __init__(self, plant: Plant, lanes: int) -> None:
-        self.plant = plant
-        self._joints = jnp.zeros((plant.num_hinge_rows, lanes), jnp.float32)
-        self._bodies = jnp.zeros((1 + plant.num_hinge_rows, lanes), jnp.float32)
-
-    def root(self, state: PyTree) -> RootState:
-        x = self._bodies[0]
-        return RootState((x,) * 3, (x,) * 4, (x,) * 3, (x,) * 3)
-
-    def joints(self, state: PyTree) -> tuple[jax.Array, jax.Array]:
-        return self._joints, self._joints
-
-    def servo_torque(self, state: PyTree, ctrl: jax.Array) -> jax.Array:
-        return self._joints
-
-    def contact_force(self, state: PyTree, water: Water, wrench: Any = ()) -> jax.Array:
-        return self._bodies
-
-    def body_motions(self, state: PyTree) -> BodyMotion:
-        x = self._bodies
-        return BodyMotion((x,) * 3, (x,) * 3, (x,) * 3, x, (x,) * 3, (x,) * 3, (x, x))
-
-    def contact_by_half(self, state: PyTree, water: Water) -> Any:
-        x = self._bodies[0]
-        return defaultdict(lambda: (x, x))
-
-
 def readings_at_rest(plant: Plant, lanes: int, signals: Sequence[str]) -> SensorReadings:
     """Readings of the right shapes, to check a controller with.
 
     Raises:
         InputError: there is no such module.
     """
-    engine: Any = _RestingEngine(plant, lanes)
+    joints = jnp.zeros((plant.num_hinge_rows, lanes), jnp.float32)
+    bodies = jnp.zeros((1 + plant.num_hinge_rows, lanes), jnp.float32)
+    core, vector = bodies[0], (bodies,) * 3
+    # Of an `Engine`, what readings call.
+    engine: Any = SimpleNamespace(
+        plant=plant,
+        root=lambda *_: RootState((core,) * 3, (core,) * 4, (core,) * 3, (core,) * 3),
+        joints=lambda *_: (joints, joints),
+        servo_torque=lambda *_: joints,
+        contact_force=lambda *_: bodies,
+        body_motions=lambda *_: BodyMotion(
+            vector, vector, vector, bodies, vector, vector, vector[:2]
+        ),
+        contact_by_half=lambda *_: defaultdict(lambda: (core, core)),
+    )
     context = EpisodeContext(noise=jnp.zeros(lanes, jnp.uint32))
     memory = init_memory(signals, engine, (), context)
     water, time = Water(0.0, (0.0, 0.0, 0.0)), jnp.zeros((), jnp.float32)

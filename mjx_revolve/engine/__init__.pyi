@@ -1,5 +1,5 @@
 from .batch import Capacity as Capacity
-from .engines import Engine as Engine
+from .engine import Engine as Engine
 from .engines import make_engine as make_engine
 from .interaction import ContactParameters as ContactParameters
 from .kinematics import body_poses as body_poses

@@ -14,7 +14,7 @@ from mjx_revolve.engine.hydrodynamics import PreviousStep, forces_on_parts, wate
 from mjx_revolve.engine.kinematics import forward_kinematics
 from mjx_revolve.engine.level import Level
 from mjx_revolve.engine.robot import Robot
-from mjx_revolve.engine.servos import motor_torque
+from mjx_revolve.engine.servos import motor_torque, spring_damping
 from mjx_revolve.engine.single_tree import SingleTree, make_single_tree
 from mjx_revolve.engine.state import State, effective_gravity
 from mjx_revolve.engine.step_constants import IMMOBILE_INERTIA
@@ -58,11 +58,15 @@ def motor_torques(
 ) -> np.ndarray:
     """Torque of the motors along a trajectory, by the servos' law, without the joints' friction.
 
+    That of the step which led to each row. It is taken at the angle that the step began with: at
+    the new one, under a command that is a step old, a servo would lag by k_p dt q̇, which is more
+    than its whole torque where limbs are light.
+
     Args:
         robot: from `build_robot`.
-        qpos: `[S, nq]` configurations.
-        qvel: `[S, nv]` velocities.
-        ctrl: `[S, nu]` commands.
+        qpos: `[S, nq]` configurations after steps.
+        qvel: `[S, nv]` velocities after them.
+        ctrl: `[S, nu]` commands in them.
         variation: factors on coefficients of the motors, a number each; None for none.
 
     Returns:
@@ -71,10 +75,15 @@ def motor_torques(
     tree = make_single_tree(robot, contact=False).with_variation(variation)
     hinges = (np.asarray(qpos)[:, 7:], np.asarray(qvel)[:, 6:], np.asarray(ctrl)[:, robot.servos])
     angle, speed, targets = (tree.joints_to_tree(jnp.asarray(x.T)) for x in hinges)
-    still = (jnp.zeros(len(hinges[0])),) * 3
-    state = State(still, still, still, still, angle, speed)
-    rows = servo_torque(tree, state, targets)
-    return np.asarray(tree.tree_to_joints(tree.split_rows(rows), still[0])).T
+    dt, damped, like = tree.world.timestep, spring_damping(tree.world), jnp.zeros(len(hinges[0]))
+
+    def torque(level: Level, angle: Scalar, speed: Scalar, target: Scalar) -> Scalar:
+        assert level.hinges is not None
+        # Semi-implicit Euler: a step turns a hinge by dt times its new speed.
+        return motor_torque(level.hinges, angle - dt * speed, speed, target, dt, damped)
+
+    rows = tree.join_rows(tree.map(torque, angle, speed, targets), like)
+    return np.asarray(tree.tree_to_joints(tree.split_rows(rows), like)).T
 
 
 def external_force(tree: Tree, state: State, water: Water, thrusts: Any) -> tuple[Vec, Vec]:

@@ -19,20 +19,21 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjx_revolve.engine import forces, population
+from mjx_revolve.engine import population
 from mjx_revolve.engine.dynamics import inertia_and_momentum, midpoint_forces, with_bed
+from mjx_revolve.engine.engine import Engine
 from mjx_revolve.engine.hydrodynamics import PreviousStep
-from mjx_revolve.engine.kinematics import body_motions, center_of_mass
 from mjx_revolve.engine.plant import Plant, plant_of
 from mjx_revolve.engine.robot import Robot, check_timestep, import_mjx
 from mjx_revolve.engine.servos import end_stop, own_torque, servo, spring_damping
 from mjx_revolve.engine.single_tree import SingleTree, make_single_tree
 from mjx_revolve.engine.state import RootState, State, integrate_quat
 from mjx_revolve.engine.thrusters import run_thrusters
+from mjx_revolve.engine.tree import Tree
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.inertia import BodyMotion, SpatialInertia, cross_force, gyroscope
-from mjx_revolve.numerics.spatial import Vec, full, quat_to_mat
+from mjx_revolve.numerics.spatial import full, quat_to_mat
 from mjx_revolve.water.flow import Water
 
 mjx = import_mjx()
@@ -103,7 +104,7 @@ class _Flow(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class MjxEngine:
+class MjxEngine(Engine[MjxState]):
     """MJX's step of a robot as an `Engine`, for a population on the last axis.
 
     Attributes:
@@ -208,7 +209,7 @@ class MjxEngine:
         """The thrusters' commands behind their lag."""
         return state.command
 
-    # By the population engine's functions; their rows of hinges are those of the levels.
+    # How the passes of all engines see it; their rows of hinges are those of the levels.
 
     def _state(self, state: MjxState) -> State:
         found = population.init(self.tree, state.qpos, state.qvel)
@@ -216,52 +217,16 @@ class MjxEngine:
             submerged=found.submerged and (state.submerged[0], state.submerged[1:])
         )
 
-    def _own_order(self, rows: jax.Array, like: jax.Array) -> jax.Array:
-        """Rows of hinges in the robot's order, behind that of the core where there is one."""
+    def _ordered(self, rows: jax.Array, seen: State) -> jax.Array:
         first = len(rows) - self.plant.num_hinges
-        hinges = self.tree.tree_to_joints(self.tree.split_rows(rows[first:]), like)
+        hinges = self.tree.tree_to_joints(self.tree.split_rows(rows[first:]), seen.position[0])
         return jnp.concatenate([rows[:first], hinges])
 
-    def servo_torque(
-        self, state: MjxState, ctrl: Float[Array, "n lanes"]
-    ) -> Float[Array, "hinges lanes"]:
-        """Torque of the servos under a command [N·m]."""
-        targets = self.tree.joints_to_tree(ctrl[: self.plant.num_hinges])
-        rows = forces.servo_torque(self.tree, self._state(state), targets)
-        return self._own_order(rows, state.qpos[0])
+    def _targets(self, ctrl: jax.Array) -> Any:
+        return self.tree.joints_to_tree(ctrl[: self.plant.num_hinges])
 
-    def body_motions(self, state: MjxState) -> BodyMotion:
-        """Motion of all rigid bodies; see `kinematics.body_motions`."""
-        rows = body_motions(self.tree, self._state(state))
-        return jax.tree.map(lambda x: self._own_order(x, state.qpos[0]), rows)
-
-    def center_of_mass(self, state: MjxState) -> Vec:
-        """Centre of mass of whole robots; see `kinematics.center_of_mass`."""
-        return center_of_mass(self.tree, self._state(state))
-
-    def with_touch(self, state: MjxState) -> MjxState:
-        """The same: contacts between own modules are not to be had."""
-        return state
-
-    def contact_force(
-        self, state: MjxState, water: Water, wrench: Any = ()
-    ) -> Float[Array, "bodies lanes"]:
-        """Force of contacts on each rigid body; see `forces.contact_force`."""
-        rows = forces.contact_force(self.tree, self._state(state), water, wrench)
-        return self._own_order(rows, state.qpos[0])
-
-    def contact_by_half(
-        self, state: MjxState, water: Water
-    ) -> tuple[tuple[jax.Array, jax.Array], ...]:
-        """Force of the bed on the halves of each module."""
-        return forces.contact_by_half(self.tree, self._state(state), water)
-
-    def external_force(
-        self, state: MjxState, ctrl: Float[Array, "n lanes"], water: Water
-    ) -> tuple[Vec, Vec]:
-        """Force of the bed and of the water on whole robots; see `forces.external_force`."""
-        thrusts = self._thrust(state, ctrl)[1]
-        return forces.external_force(self.tree, self._state(state), water, thrusts)
+    def _thrusts(self, tree: Tree, state: MjxState, ctrl: jax.Array) -> Any:
+        return self._thrust(state, ctrl)[1]
 
 
 def make_mjx_engine(robot: Robot, contact: bool = True) -> MjxEngine:

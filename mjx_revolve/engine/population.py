@@ -14,10 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mjx_revolve.engine import forces
 from mjx_revolve.engine.dynamics import accelerate
+from mjx_revolve.engine.engine import Engine
 from mjx_revolve.engine.interaction import RobotInteraction
-from mjx_revolve.engine.kinematics import body_motions, center_of_mass
 from mjx_revolve.engine.plant import Plant, actuators_of, plant_of
 from mjx_revolve.engine.robot import Robot, check_timestep
 from mjx_revolve.engine.single_tree import SingleTree, make_single_tree
@@ -25,10 +24,8 @@ from mjx_revolve.engine.state import RootState, State, integrate
 from mjx_revolve.engine.thrusters import run_thrusters
 from mjx_revolve.engine.tree import Tree
 from mjx_revolve.engine.variation import Variation
-from mjx_revolve.numerics.inertia import BodyMotion
 from mjx_revolve.numerics.spatial import (
     Scalar,
-    Vec,
     add,
     cross,
     matTvec,
@@ -43,7 +40,7 @@ from mjx_revolve.water.flow import Water
 
 
 @dataclass(frozen=True, eq=False)
-class PopulationEngine:
+class PopulationEngine(Engine[State]):
     """The population step as an `Engine`; its functions are pure, and run under jit, vmap and grad.
 
     Attributes:
@@ -61,7 +58,7 @@ class PopulationEngine:
     elementwise = True
 
     @property
-    def _tree(self) -> Tree:
+    def _varied(self) -> Tree:
         # Varied where they are used: a loop then holds a few factors, not all constants by lanes.
         return self.tree.with_variation(self.variation)
 
@@ -82,7 +79,7 @@ class PopulationEngine:
     def _step(
         self, state: State, ctrl: jax.Array, water: Water, wrench: Any
     ) -> tuple[State, jax.Array]:
-        tree = self._tree
+        tree = self._varied
         dt = tree.world.timestep
         targets, command, thrusts, pumped = actuate(tree, state, ctrl)
         # The whole step is seen from the uniform current: there, no current is left.
@@ -115,58 +112,14 @@ class PopulationEngine:
         like = state.position[0]
         return self.tree.join_rows(state.angle, like), self.tree.join_rows(state.speed, like)
 
-    def servo_torque(
-        self, state: State, ctrl: Float[Array, "n lanes"]
-    ) -> Float[Array, "hinges lanes"]:
-        """Torque of the servos under a command [N·m]."""
-        tree = self._tree
-        targets = tree.split_rows(ctrl[: ctrl.shape[0] - tree.thrusters.count])
-        return forces.servo_torque(tree, state, targets)
-
     def thruster_command(self, state: State) -> Float[Array, "nthruster lanes"]:
         """The thrusters' commands behind their lag."""
         if self.tree.thrusters.count:
             return state.command
         return jnp.zeros((0, *state.position[0].shape))
 
-    def body_motions(self, state: State) -> BodyMotion:
-        """Motion of all rigid bodies; see `kinematics.body_motions`."""
-        return body_motions(self.tree, state)
-
-    def center_of_mass(self, state: State) -> Vec:
-        """Centre of mass of whole robots; see `kinematics.center_of_mass`."""
-        return center_of_mass(self.tree, state)
-
-    def with_touch(self, state: State) -> State:
-        """The state from which on contacts between own modules are felt; none yet."""
-        tree, like = self.tree, state.position[0]
-        if not tree.meets:
-            return state
-        rows = 1 + self.plant.num_hinge_rows
-        if isinstance(tree, SingleTree):
-            rows += 2 * tree.robot.morphology.num_modules
-        return state._replace(pressed=jnp.zeros((rows, *like.shape), like.dtype))
-
-    def contact_force(
-        self, state: State, water: Water, wrench: Any = ()
-    ) -> Float[Array, "bodies lanes"]:
-        """Force of contacts on each rigid body; see `forces.contact_force`."""
-        return forces.contact_force(self.tree, state, water, wrench)
-
-    def contact_by_half(
-        self, state: State, water: Water
-    ) -> tuple[tuple[jax.Array, jax.Array], ...] | None:
-        """Force of contacts on the halves of each module; None for many different robots."""
-        if not isinstance(self.tree, SingleTree):
-            return None
-        return forces.contact_by_half(self.tree, state, water)
-
-    def external_force(
-        self, state: State, ctrl: Float[Array, "n lanes"], water: Water
-    ) -> tuple[Vec, Vec]:
-        """Force of the bed and of the water on whole robots; see `forces.external_force`."""
-        tree = self._tree
-        return forces.external_force(tree, state, water, actuate(tree, state, ctrl)[2])
+    def _thrusts(self, tree: Tree, state: State, ctrl: jax.Array) -> Any:
+        return actuate(tree, state, ctrl)[2]
 
 
 def actuate(tree: Tree, state: State, ctrl: jax.Array) -> tuple[Any, Any, Any, Scalar]:

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from mjx_revolve.control.controller import Controller
 from mjx_revolve.control.courses import course_path
 from mjx_revolve.control.readings import EpisodeContext
-from mjx_revolve.engine.engines import Engine
+from mjx_revolve.engine.engine import Engine
 from mjx_revolve.engine.plant import BodyGeometry
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.config import Config, TaskConfig

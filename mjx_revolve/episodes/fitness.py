@@ -30,7 +30,8 @@ from mjx_revolve.control.readings import EpisodeContext, SensorMemory
 from mjx_revolve.control.sensors import resolve_sensors
 from mjx_revolve.engine.batch import Capacity, PackedBodies, fit_capacity, pack_bodies
 from mjx_revolve.engine.batched_trees import make_batched_trees
-from mjx_revolve.engine.engines import Engine, make_engine
+from mjx_revolve.engine.engine import Engine
+from mjx_revolve.engine.engines import make_engine
 from mjx_revolve.engine.kinematics import body_poses
 from mjx_revolve.engine.plant import (
     BodyGeometry,
@@ -175,6 +176,9 @@ class Fitness(EpisodeSpec[tuple[()]]):
         self, trajectory: Trajectory, key: jax.Array, trial: int = 0
     ) -> tuple[float, dict[str, float]]:
         """Scores one episode, as evolution does, from its trajectory.
+
+        A trajectory has poses, not wakes: of laws with a memory (thin plates and fins in the
+        default water), a task with the record "forces" gets those of parts without a past.
 
         Args:
             trajectory: from `replay(genes, key, trial)`, all rows.

@@ -20,7 +20,7 @@ from mjx_revolve.control.readings import (
     read_sensors,
     update_memory,
 )
-from mjx_revolve.engine.engines import Engine
+from mjx_revolve.engine.engine import Engine
 from mjx_revolve.engine.interaction import InteractionForces
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.numerics.inertia import BodyMotion

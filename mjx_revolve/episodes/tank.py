@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from mjx_revolve.control.readings import EpisodeContext
 from mjx_revolve.engine.batched_trees import make_batched_trees
-from mjx_revolve.engine.engines import Engine
+from mjx_revolve.engine.engine import Engine
 from mjx_revolve.engine.interaction import ContactParameters, make_interaction
 from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import Robot

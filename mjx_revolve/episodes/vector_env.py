@@ -267,7 +267,7 @@ def make_vector_env(
         control_rate: actions in a second [Hz]; by default the possible one nearest to 20.
         autoreset_mode: `NextStep`, Gymnasium's default: an episode that is over restarts at the
             next step, which ignores the action; or `SameStep`: at once, with its last observation
-            in infos.
+            in infos. Gymnasium's `AutoresetMode` does as well.
         **overrides: as `make_fitness` takes them.
 
     Returns:
@@ -281,6 +281,7 @@ def make_vector_env(
     whole = isinstance(num_envs, int | np.integer) and not isinstance(num_envs, bool)
     if not whole or num_envs < 1:
         raise InputError("num_envs", "a whole number >= 1", repr(num_envs))
+    autoreset_mode = getattr(autoreset_mode, "value", autoreset_mode)  # Gymnasium's `AutoresetMode`
     if autoreset_mode not in AUTORESET_MODES:
         known = f"one of {', '.join(AUTORESET_MODES)}"
         raise InputError("autoreset_mode", known, repr(autoreset_mode))

@@ -23,6 +23,7 @@ from mjx_revolve.control.readings import NearestRobot, SensorReadings, readings_
 from mjx_revolve.engine.plant import Plant, plant_of
 from mjx_revolve.engine.robot import Robot
 from mjx_revolve.episodes.fitness import Fitness
+from mjx_revolve.formats.brain_code import one_line
 from mjx_revolve.formats.brain_program import Builder, Program, kind_of
 from mjx_revolve.formats.links import make_links, plain, unique_names
 from mjx_revolve.inputs.errors import InputError
@@ -191,7 +192,7 @@ def _lower(
     for name, unit, words, parts in _list_readings(readings):
         sizes = [int(np.prod(part.shape)) for part in parts]
         number = builder.input(name, "real", sum(sizes))
-        signals.append(Signal(name, unit, _comment(words), sum(sizes), number))
+        signals.append(Signal(name, unit, one_line(words), sum(sizes), number))
         ends = np.cumsum([0, *sizes])
         for part, low, high in zip(parts, ends[:-1], ends[1:], strict=True):
             leaf = builder.take([number], np.arange(low, high))
@@ -279,50 +280,3 @@ def _readings_at(
                 where = f", {at} on the core's rigid body, then on what each hinge carries"
             label = plain(f"{place} {name}".strip())
             yield label, unit, words + where, [*x] if isinstance(x, tuple) else [x]
-
-
-def describe_brain(brain: Brain) -> tuple[str, list[str], list[str]]:
-    """The text of the comments in all files of a brain.
-
-    Args:
-        brain: from `make_brain`.
-
-    Returns:
-        A title, notes, and the inputs and outputs, line by line.
-    """
-    words = [
-        f"Call `step` {brain.rate:.6g} times a second, at times k / {brain.rate:.6g} s from 0, and",
-        "let the targets go evenly from the last command to this one until the next; where the run",
-        "says `controller.between: hold`, hold them. In single precision,",
-        "a sine of 2 Hz that has run for an hour errs by 0.003 rad.",
-        "Frames: x, y, z of the core, or of the module where a sensor sits; z is up at rest.",
-        "Feed it what your sensors say, in these units. It clips and scales as in the simulation;",
-        "noise, rate and delay are your devices' own, and hold the last reading between samples.",
-        "A reading that is not a number spoils a state for good: keep such out.",
-    ]
-    if brain.sensors:
-        words += ["", "As simulated:"]
-    for sensor in brain.sensors:
-        low, high = sensor.limits
-        text = f"- {sensor.label}: {sensor.kind.what}, {low:g} to {high:g} {sensor.kind.unit}"
-        text = text.removesuffix(" -")
-        text += f", noise {sensor.noise:g}" if sensor.noise else ""
-        text += f", {sensor.rate:g} Hz" if sensor.rate is not None else ""
-        text += f", {sensor.delay:g} s late" if sensor.delay else ""
-        words.append(text)
-    interface = ["Sensors:"]
-    interface += [f"- {s.name} [{s.size}], {s.unit}: {s.words}" for s in brain.signals]
-    if any(signal.size == brain.num_hinges > 1 for signal in brain.signals):
-        interface.append("Hinges are in the order of the commands.")
-    interface += ["Commands, within low and high:"]
-    for k, name in enumerate(brain.commands):
-        unit = "angle of the hinge [rad]" if k < brain.num_hinges else "of the thruster [-]"
-        interface.append(f"- {k}: {name}, {unit}, {brain.low[k]:.6g} to {brain.high[k]:.6g}")
-    title = f"The brain of {brain.robot}, from mjx_revolve."
-    return _comment(title), [*map(_comment, words)], [*map(_comment, interface)]
-
-
-def _comment(text: str) -> str:
-    """A line that ends no comment, whatever names are in it."""
-    one = " ".join(text.split())
-    return one.replace("\\", "/").replace('"', "'").replace("*/", "* /")

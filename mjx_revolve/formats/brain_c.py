@@ -6,19 +6,11 @@ import re
 
 import numpy as np
 
-from mjx_revolve.formats.brain import Brain, describe_brain
+from mjx_revolve.formats.brain import Brain
 from mjx_revolve.formats.brain_code import TEMPLATES, Code, array_text, is_bracketed
 from mjx_revolve.formats.brain_program import Value, View, kind_of, number_text
 
 _TYPES = {"real": "brain_real", "int": "int32_t", "bool": "bool"}
-
-# Functions, by name: only those that are used are written.
-_FUNCTIONS = {
-    "brain_max": ("brain_real a, brain_real b", "(a > b || a != a) ? a : b"),
-    "brain_min": ("brain_real a, brain_real b", "(a < b || a != a) ? a : b"),
-    "brain_square": ("brain_real a", "a * a"),
-    "brain_sign": ("brain_real a", "a > 0 ? 1 : a < 0 ? -1 : a"),
-}
 
 
 class _CCode(Code):
@@ -77,19 +69,10 @@ def make_brain_c(brain: Brain, stem: str) -> tuple[str, str]:
     """
     program, code = brain.program, _CCode(brain.program)
     code.write()
-    title, words, interface = describe_brain(brain)
     states = [program.values[program.state[k]] for k in code.live_states]
-    fields = [f"    {_TYPES[v.kind]} {v.label}[{v.size}];" for v in states]
-    sensors = [
-        f"    brain_real {s.name}[{s.size}]; /* {s.unit}: {s.words} */" for s in brain.signals
-    ]
-    # C99 has no empty structures.
-    nothing = ["    char nothing;"]
     header = TEMPLATES.get_template("brain.h.jinja").render(
-        comment="\n   ".join([title, *words, *interface]).replace("`", ""),
-        rate=repr(brain.rate), count=len(brain.commands),
-        sensors="\n".join(sensors or nothing), state="\n".join(fields or nothing),
-    )  # fmt: skip
+        brain=brain, states=states, types=_TYPES
+    )
     copies = []
     for k, value in zip(code.live_states, states, strict=True):
         after = program.after[k]
@@ -117,19 +100,10 @@ def make_brain_c(brain: Brain, stem: str) -> tuple[str, str]:
         f"{name}[{data.size}] = {{{array_text(data, _number)[1:-1]}}};"
         for name, data in code.constants.items()
     ]
-    every = "\n".join([*lines, *start.lines])
-    functions = [
-        f"static brain_real {name}({args}) {{ return {text}; }}"
-        for name, (args, text) in _FUNCTIONS.items()
-        if f"{name}(" in every
-    ]
-    names = ", ".join(f'"{name}"' for name in brain.commands)
     return header, TEMPLATES.get_template("brain.c.jinja").render(
+        brain=brain,
         stem=stem,
-        tables="\n".join([*tables, *functions, ""]),
-        names=names,
-        low=", ".join(map(repr, brain.low)),
-        high=", ".join(map(repr, brain.high)),
+        tables=tables,
         start=_function(start.lines, ["state"]),
         body=_function([*buffers, *lines], ["state", "time", "sensors"]),
     )

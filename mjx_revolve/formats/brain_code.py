@@ -25,8 +25,16 @@ from mjx_revolve.formats.brain_program import (
 )
 from mjx_revolve.inputs.templates import make_templates
 
+
+def one_line(text: str) -> str:
+    """A line that ends no comment, whatever names are in it."""
+    one = " ".join(text.split())
+    return one.replace("\\", "/").replace('"', "'").replace("*/", "* /")
+
+
 TEMPLATES = make_templates(Path(__file__).with_name("templates"), html=False)
 """Of the files, around what `Code` writes."""
+TEMPLATES.filters["one_line"] = one_line
 # Longer expressions get a name; a choice.
 _MAX_EXPRESSION = 100
 

@@ -6,7 +6,7 @@ import textwrap
 
 import numpy as np
 
-from mjx_revolve.formats.brain import Brain, describe_brain
+from mjx_revolve.formats.brain import Brain
 from mjx_revolve.formats.brain_code import TEMPLATES, Code, array_text, is_bracketed
 from mjx_revolve.formats.brain_program import Value, View, find_view, kind_of, number_text
 
@@ -90,7 +90,6 @@ def make_brain_python(brain: Brain) -> str:
     """
     program, code = brain.program, _PythonCode(brain.program)
     code.write()
-    title, words, interface = describe_brain(brain)
     after = [code.name_of(program.after[k]) for k in code.live_states]
     tables = ""
     for name, data in code.constants.items():
@@ -102,28 +101,15 @@ def make_brain_python(brain: Brain) -> str:
         filled = f"np.full({value.size}, {_number(data[0])}, {_DTYPES[value.kind]})"
         whole = f"np.array({array_text(data, _number)}, {_DTYPES[value.kind]})"
         start.append(filled if (data == data[0]).all() else whole)
-    body = [f"{s.name} = _read(sensors, {s.name!r})" for s in brain.signals]
-    if brain.time in program.live:
-        body.insert(0, "time = np.asarray(time, REAL).reshape(1)")
-    if states:
-        body.append(f"({', '.join(value.label for value in states)},) = self.state")
-    body += code.lines
-    if states:
-        body.append(f"self.state = ({', '.join(after)},)")
-    count = len(brain.commands)
-    body.append(f"return np.array({code.name_of(program.commands)}, REAL).reshape({count})")
     return TEMPLATES.get_template("brain.py.jinja").render(
-        title=title,
-        words="\n".join(words),
-        rate=brain.rate,
-        interface="\n# ".join(interface),
-        commands=wrapped(repr(list(brain.commands))),
-        low=wrapped(f"np.array({list(brain.low)}, REAL)"),
-        high=wrapped(f"np.array({list(brain.high)}, REAL)"),
-        sensors=wrapped(repr({signal.name: signal.size for signal in brain.signals})),
+        brain=brain,
+        sensors={signal.name: signal.size for signal in brain.signals},
         tables=tables,
         start=", ".join([*start, ""]).strip(),
-        body="\n".join(wrapped(f"        {line}") for line in body),
+        states=[value.label for value in states],
+        after=after,
+        lines=code.lines,
+        commands=code.name_of(program.commands),
     )
 
 
@@ -139,3 +125,6 @@ def wrapped(line: str) -> str:
         textwrap.wrap(kept, 100, subsequent_indent=indent, break_long_words=False,
                       break_on_hyphens=False, drop_whitespace=True)
     ).replace("\xa0", " ")  # fmt: skip
+
+
+TEMPLATES.filters["wrapped"] = wrapped

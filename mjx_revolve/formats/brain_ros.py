@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mjx_revolve.formats.brain import Brain, describe_brain
+from mjx_revolve.formats.brain import Brain
 from mjx_revolve.formats.brain_code import TEMPLATES
 
 
@@ -16,10 +16,4 @@ def make_brain_node(brain: Brain, stem: str) -> str:
     Returns:
         A script; it needs rclpy and the brain's file. Topics and units are those of our bags.
     """
-    title, _, interface = describe_brain(brain)
-    return TEMPLATES.get_template("brain_node.py.jinja").render(
-        title=title.rstrip(".") + ", as a ROS 2 node.",
-        stem=stem,
-        interface="\n".join(interface),
-        count=brain.num_hinges,
-    )
+    return TEMPLATES.get_template("brain_node.py.jinja").render(brain=brain, stem=stem)

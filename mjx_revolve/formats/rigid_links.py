@@ -65,7 +65,8 @@ class RigidLink:
         inertia: `[4, 4]` pseudo-inertia (see `inertias`), link frame.
         solid: shapes that collide.
         seen: visible shapes.
-        both: of MJCF, those in `solid` that MuJoCo's viewer shows as well.
+        both: those in `solid` that are all there is to see: of MJCF, what MuJoCo's viewer shows as
+            well; of URDF, of links without visible shapes.
     """
 
     name: str
@@ -124,6 +125,12 @@ def read_rigid_robot(path: str | Path) -> RigidRobot:
         robot = read(root, Path(path))
         if robot.links[0].inertia[3, 3] <= 0:
             raise InputError(robot.links[0].name, "a root with a mass", "none")
+        for link in robot.links:
+            # Shapes that do not collide stand for those that do, or are an eye on a hull. A choice:
+            # those of less than half of its volume.
+            seen, both = (sum(s.volume for s in shapes) for shapes in (link.seen, link.both))
+            if link.seen and seen < both / 2:
+                link.seen[:0] = link.both
         return robot
 
 
@@ -246,9 +253,12 @@ def _read_urdf(root: Element, path: Path) -> RigidRobot:
         inertial = links[name].find("inertial")
         if inertial is not None:
             link.inertia += _inertial(inertial, place)
+        solid = len(link.solid)
         for tag, shapes in (("collision", link.solid), ("visual", link.seen)):
             for element in links[name].findall(tag):
                 shapes += _shape(element, name, place, path, colors, robot.missing)
+        if links[name].find("visual") is None:
+            link.both += link.solid[solid:]
         for joint in reversed(below.get(name, [])):
             child = joint.find("child")
             assert child is not None
@@ -431,12 +441,6 @@ def _read_mjcf(root: Element, path: Path) -> RigidRobot:
         link.inertia += _spread(float(model.body_mass[body]), center, axes, moments)
         for geom in np.flatnonzero(model.geom_bodyid == body):
             _mjcf_shape(model, int(geom), place, link, missing)
-    for link in robot.links:
-        # Shapes that do not collide stand for those that do, or are an eye on a hull. A choice:
-        # those of less than half of its volume.
-        seen, both = (sum(s.volume for s in shapes) for shapes in (link.seen, link.both))
-        if link.seen and seen < both / 2:
-            link.seen[:0] = link.both
     turns = np.isin(model.actuator_trntype, list(_MOVES_JOINTS))
     for count, words in (
         ((model.geom_bodyid == 0).sum(), "geoms of the world"), (model.neq, "equality constraints"),

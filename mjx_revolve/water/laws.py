@@ -237,7 +237,8 @@ class PartFlow(NamedTuple):
         velocity: of the box's centre relative to the water (Fossen's ν_r) [m/s].
         angular_velocity: of the part [rad/s].
         submerged: submerged fraction [-].
-        memory: what the law keeps of the steps before, `PartDragLaw.memory` numbers; () for none.
+        memory: what the law keeps of the steps before, `PartDragLaw.memory` numbers; () for none,
+            and where what came before is not known: the law then has its force in a steady flow.
     """
 
     velocity: Vec

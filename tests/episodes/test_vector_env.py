@@ -87,7 +87,10 @@ def replay(fitness, actions, every, seed, episode=0):
 @pytest.mark.slow
 def test_spaces_and_what_comes_out_are_as_gymnasium_has_them(env, episode):
     assert isinstance(env, gymnasium.vector.VectorEnv)
-    assert env.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode.NEXT_STEP
+    modes = gymnasium.vector.AutoresetMode
+    assert env.metadata["autoreset_mode"] == modes.NEXT_STEP
+    other = make_vector_env(env.fitness.config, 2, autoreset_mode=modes.SAME_STEP)
+    assert other.metadata["autoreset_mode"] == modes.SAME_STEP
     assert env.control_rate == pytest.approx(20)
     assert env.observation_names[:5] == ("tilt x", "tilt y", "tilt z", "depth", "accelerometer x")
     assert [name.split()[0] for name in env.observation_names[-2:]] == ["angle", "speed"]

@@ -426,6 +426,19 @@ def test_a_bad_recording_is_one_line(kind, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+def test_recordings_count_once_and_are_with_own_names(auv, tmp_path, capsys):
+    paths = [str(tmp_path / trial / "swim.csv") for trial in ("one", "two")]
+    for path in paths:
+        Path(path).parent.mkdir()
+        write_csv(Path(path), changed())
+    again = str(tmp_path / "one" / ".." / "one" / "swim.csv")
+    assert run_command(command.main, ["auv", *paths, again]) == 2
+    assert f"{again}: expected each recording once; found it twice" in capsys.readouterr().err
+    read = [load_recording(path, auv, {}) for path in paths]
+    assert [one.name for one in command._with_own_names(read, paths)] == paths
+    assert command._with_own_names(read[:1], paths[:1])[0].name == "swim"
+
+
 MARKS = {"a": (0.0, 0.1, 0.0), "b": (0.0, -0.1, 0.0), "c": (0.05, 0.03, 0.0)}
 
 

@@ -113,6 +113,12 @@ WRONG = [
     (["a.yaml", "--mjcf", "file/a.xml"], "--mjcf file/a.xml: expected the folder file; found a"),
     (["a.yaml", "--mjcf", "a.xml", "--meshes", "x/"],
      "--meshes: expected --urdf, --sdf or all formats; found neither"),
+    (["a.yaml", "--build", "a.html", "--duration", "3"],
+     "--duration: expected --mcap or all formats; found neither"),
+    (["a.yaml", "--urdf", "a.urdf", "--seed", "3"],
+     "--seed: expected --mjcf, --sdf, --mcap or all formats; found neither"),
+    (["a.yaml", "--urdf", "a.urdf", "--meshes", "package://a/meshes"],
+     "--meshes: expected a prefix that ends in /; found 'package://a/meshes'"),
     (["run", "--world", "lake"], "world: expected none: a champion swims in the world it evolved"),
 ]  # fmt: skip
 

@@ -360,3 +360,13 @@ def test_what_stands_around_a_robot_is_no_part_of_it(tmp_path):
     world += 'link="base"/><origin xyz="0 0 5"/></joint><link name="base">'
     found = import_robot(write(tmp_path, URDF.replace('<link name="base">', world), "robot.urdf"))
     assert found.morphology == import_robot(write(tmp_path, URDF, "robot.urdf")).morphology
+
+
+def test_an_eye_that_is_fixed_to_a_hull_without_a_visual_does_not_stand_for_it(tmp_path):
+    eye = '<link name="eye"><visual><geometry><sphere radius="0.01"/></geometry></visual></link>'
+    eye += '<joint name="at" type="fixed"><parent link="left"/><child link="eye"/></joint>'
+    volumes = [
+        import_robot(write(tmp_path, text, "a.urdf")).morphology.volume
+        for text in (URDF, URDF.replace("</robot>", f"{eye}</robot>"))
+    ]
+    assert volumes[1] == pytest.approx(volumes[0] + 4 / 3 * np.pi * 0.01**3)
