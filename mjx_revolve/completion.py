@@ -1,7 +1,8 @@
 """Command line: a script by which a shell completes commands, and names of what is shipped.
 
 ``eval "$(mjx-revolve completion bash)"`` in `~/.bashrc`, the same with `zsh` in `~/.zshrc`.
-The names are those of the package as it was when the script was printed.
+The names are those of the package as it was when the script was printed. Files and folders stand
+beside them: a path does wherever a name does, and `report` takes nothing else.
 """
 
 from __future__ import annotations
@@ -14,18 +15,27 @@ from mjx_revolve.inputs.commands import Parser, program, run_command
 from mjx_revolve.inputs.shipped import list_shipped
 
 _SCRIPT = """_mjx_revolve() {
-  local words
+  local words current="${COMP_WORDS[COMP_CWORD]}"
   case "$COMP_CWORD:${COMP_WORDS[1]}" in
     1:*) words="%(commands)s" ;;
     *:evolve|*:sweep) words="%(configs)s" ;;
+    *:live|*:fit) words="%(configs)s %(morphologies)s" ;;
     *:schema) words="%(kinds)s" ;;
     *:completion) words="bash zsh" ;;
+    *:report|*:passport|*:import) words="" ;;
     *) words="%(morphologies)s" ;;
   esac
-  if [ "${COMP_WORDS[COMP_CWORD-1]}" = --world ]; then words="%(worlds)s"; fi
-  COMPREPLY=($(compgen -W "$words" -- "${COMP_WORDS[COMP_CWORD]}"))
+  case "${COMP_WORDS[COMP_CWORD-1]}" in
+    --world) words="%(worlds)s" ;;
+    --out|--resume|--picture|--modules) words="" ;;
+  esac
+  COMPREPLY=($(compgen -W "$words" -- "$current"))
+  case "$COMP_CWORD:${COMP_WORDS[1]}" in
+    1:*|*:schema|*:completion) ;;
+    *) local IFS=$'\\n'; COMPREPLY+=($(compgen -f -- "$current")) ;;
+  esac
 }
-complete -o default -F _mjx_revolve mjx-revolve
+complete -o filenames -F _mjx_revolve mjx-revolve
 """
 _ZSH = """(( $+functions[compdef] )) || { autoload -Uz compinit && compinit; }
 autoload -U +X bashcompinit && bashcompinit

@@ -77,3 +77,24 @@ def test_completion_loads_in_a_shell_of_no_settings(shell):
         capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0 and "_mjx_revolve" in done.stdout and not done.stderr
+
+
+@pytest.mark.parametrize("words, expected", [
+    (["ev"], "evolve"),
+    (["report", "r"], "runs"),
+    (["viewer", "r"], "revolve_snake runs"),
+    (["viewer", "spider", "--world", "l"], "lake"),
+    (["evolve", "--resume", "r"], "runs"),
+    (["live", "lake_sw"], "lake_swim"),
+    (["inspect", "my"], "my robot.yaml"),
+    (["schema", "w"], "world"),
+])  # fmt: skip
+def test_completion_has_files_beside_names(words, expected, tmp_path):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "my robot.yaml").touch()
+    call = f"COMP_WORDS=(mjx-revolve {' '.join(words)}); COMP_CWORD={len(words)}; _mjx_revolve"
+    done = subprocess.run(
+        ["bash", "--norc", "-c", f'{make_script("bash")}\n{call}\necho "${{COMPREPLY[*]}}"'],
+        capture_output=True, text=True, cwd=tmp_path,
+    )  # fmt: skip
+    assert (done.stdout.strip(), done.stderr) == (expected, "")

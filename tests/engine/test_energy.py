@@ -7,6 +7,7 @@ from test_self_contact import fork
 from laboratory import ARM, OAR, read
 from mjx_revolve import build_robot, load_morphology, load_world, simulate
 from mjx_revolve.engine.energy import energy_balance
+from mjx_revolve.engine.forces import motor_torques
 from mjx_revolve.engine.variation import Variation
 from mjx_revolve.water.flow import water_of
 
@@ -35,6 +36,12 @@ def test_a_swimmer_in_a_current_and_in_other_water():
     own = balance(robot, found, drawn)
     assert own.residual < 0.03
     assert own.drag > 0 and own.joints > 0 and own.contact == 0 < own.work
+    # Torques as passports and bags have them do the same work.
+    speed = np.asarray(found.qvel)[:, 6:]
+    turned = robot.world.timestep * (speed[1:] + speed[:-1]) / 2
+    work = motor_torques(robot, found.qpos, found.qvel, found.ctrl, drawn)[1:] * turned
+    assert work.sum() == pytest.approx(own.given, rel=1e-3)
+    assert np.abs(work).sum() == pytest.approx(own.work, rel=1e-3)
     # Neither other coefficients nor other velocities fit.
     assert balance(robot, found).residual > 2 * own.residual
     assert balance(robot, found, drawn, 1.2).residual > 0.1

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from experiments.random_bodies import random_body
-from laboratory import at_rest, batch_engine, body, elbow_robot, march, oar_robot, read, world
+from laboratory import batch_engine, body, elbow_robot, read, world
 from mjx_revolve.body.morphology import trim_neutral
 from mjx_revolve.engine.assembly import FULL_TORQUE_ERROR
 from mjx_revolve.engine.batch import fit_capacity
-from mjx_revolve.engine.forces import motor_torques
 from mjx_revolve.engine.robot import build_robot
 from mjx_revolve.engine.servos import servo
 from mjx_revolve.engine.single_tree import make_single_tree
@@ -136,18 +135,3 @@ def test_limbs_come_to_rest_after_jumps_of_their_targets(limbs, timestep, depth)
     speeds = np.abs(np.asarray(simulate(robot, targets, qpos=start, once=True).qvel)[:, 6:])
     assert speeds[: len(targets) // 2].max() > 2
     assert speeds[-len(targets) // 8 :].max() < 0.1
-
-
-@pytest.mark.parametrize("dt", [0.005, pytest.param(0.02, marks=pytest.mark.long)])
-def test_along_a_trajectory_motors_do_the_work_that_friction_takes(dt):
-    """In a void, over whole periods, whatever the step."""
-    robot = oar_robot(world(timestep=dt))
-    ctrl = 0.6 * np.sin(2 * np.pi * dt * np.arange(round(2 / dt)))[:, None]
-    _, qpos, qvel, _ = march(robot, 2.0, *at_rest(robot), ctrl[..., None])
-    qpos, qvel, last = qpos[..., 0], qvel[..., 0], slice(round(1 / dt), None)
-    torque = motor_torques(robot, qpos, qvel, ctrl)[last, 0]
-    speed = qvel[last, 6]
-    taken = float(robot.mj_model.dof_damping[6]) * np.sum(speed**2)
-    assert np.sum(torque * speed) == pytest.approx(taken, rel=0.03)
-    # The greatest is what friction and the limb's inertia ask for, far from the effort.
-    assert np.abs(torque).max() < 0.25 * robot.assembly.effort.max()

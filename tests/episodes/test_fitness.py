@@ -12,8 +12,9 @@ from laboratory import check_refused, make_track, refusal, swimmer
 from mjx_revolve import InputError, load_world, make_fitness
 from mjx_revolve.engine.plant import body_geometry
 from mjx_revolve.episodes.config import TaskConfig
-from mjx_revolve.episodes.scoring import WORST, max_distance
+from mjx_revolve.episodes.scoring import WORST, Scores, average_trials, max_distance
 from mjx_revolve.episodes.tasks import TASKS, find_task, score_unit, shown_measure
+from mjx_revolve.numerics.xla import compiler_options
 from mjx_revolve.water.currents import CurrentField
 
 KEY = jax.random.key(7)
@@ -202,3 +203,21 @@ def test_scores_in_metres_leave_the_body_length_out():
         "my.yaml: task.unit: expected body_lengths, as the scores of search do not say that they "
         "are in body lengths; found m"
     )
+
+
+@pytest.mark.parametrize("trials", [5, 31, 32, 100])
+def test_means_over_trials_do_not_depend_on_the_population(trials):
+    values = np.random.default_rng(0).normal(size=(2, 130, trials)).astype(np.float32)
+
+    def mean(score, measure):
+        found = Scores(score, jnp.isfinite(score), {"depth_m": measure})
+        return average_trials(found, trials)
+
+    mean = jax.jit(mean, compiler_options=compiler_options())
+    score, measures = mean(*values.reshape(2, -1))
+    found = np.stack([score, measures["depth_m"]])
+    np.testing.assert_allclose(found, values.mean(2), atol=1e-6)
+    for count in (1, 3, 17):
+        alone, own = mean(*values[:, :count].reshape(2, -1))
+        np.testing.assert_array_equal(alone, score[:count])
+        np.testing.assert_array_equal(own["depth_m"], measures["depth_m"][:count])
