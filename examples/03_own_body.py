@@ -20,7 +20,9 @@ print(f"free slots of the tadpole: {free_slots(tadpole)}")
 save_morphology(tadpole, "tadpole.yaml")
 
 bodies = [load_morphology("spider"), load_morphology("fish"), tadpole]
-fitness = make_mixed_fitness("lake_swim", bodies, **{"task.duration": 4.0, "task.settle": 1.0})
+fitness = make_mixed_fitness(
+    "lake_swim", bodies, **{"task.duration": 4.0, "task.settle": 1.0, "task.horizon": None}
+)
 robots = [fitness.build(body) for body in bodies]  # no compilation per body
 genes = 0.5 * jax.random.normal(jax.random.key(0), (len(bodies), fitness.num_genes))
 still = fitness(robots, jnp.zeros_like(genes), jax.random.key(1))

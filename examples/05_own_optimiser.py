@@ -6,7 +6,10 @@ import jax.numpy as jnp
 from mjx_revolve import make_fitness
 
 POPULATION, PARENTS = 64, 16
-fitness = make_fitness("lake_swim", **{"task.duration": 4.0, "task.settle": 1.0, "task.trials": 1})
+fitness = make_fitness(
+    "lake_swim",
+    **{"task.duration": 4.0, "task.settle": 1.0, "task.horizon": None, "task.trials": 1},
+)
 
 
 @jax.jit

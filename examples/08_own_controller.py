@@ -27,7 +27,7 @@ def make_wave(plant, settings):
 
 
 if __name__ == "__main__":
-    wave = {"controller.type": f"{__file__}:make_wave", "task.duration": 4.0}
+    wave = {"controller.type": f"{__file__}:make_wave", "task.duration": 4.0, "task.horizon": None}
     fitness = make_fitness("lake_swim", morphology="snake", **wave)  # or any other body
     genes = np.random.default_rng(0).normal(0, 1, (64, fitness.num_genes))
     scores = fitness(genes, jax.random.key(0))

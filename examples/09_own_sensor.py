@@ -7,6 +7,7 @@ from mjx_revolve import make_fitness
 
 settings = {
     "task.duration": 4.0,
+    "task.horizon": None,
     "task.trials": 1,
     "controller.type": "mlp",
     "controller.gain": 2.0,  # the default: that of the oscillators that this replaces is another

@@ -43,6 +43,7 @@ if __name__ == "__main__":
         "evolution.population_size": 4,
         "evolution.generations": 2,
         "task.duration": 3,
+        "task.horizon": "null",
         "task.settle": 1,
         "task.trials": 1,
         "evolution.passport": "false",  # so short a run finds nothing to judge

@@ -6,7 +6,7 @@ import numpy as np
 from mjx_revolve.episodes import register_envs
 
 register_envs()
-quick = {"task.duration": 2.0, "task.settle": 0.5}
+quick = {"task.duration": 2.0, "task.settle": 0.5, "task.horizon": None}
 
 env = gymnasium.make("mjx_revolve/FishSwim-v0", **quick)
 seen, _ = env.reset(seed=0)

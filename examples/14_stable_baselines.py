@@ -6,7 +6,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from mjx_revolve.episodes import make_sb3_env
 
-quick = {"task.duration": 4.0, "task.settle": 0.5}
+quick = {"task.duration": 4.0, "task.settle": 0.5, "task.horizon": None}
 water = VecMonitor(make_sb3_env("fish_swim", 64, **quick))
 model = PPO("MlpPolicy", water, n_steps=20, batch_size=320, gamma=0.98, seed=0)
 for _ in range(3):

@@ -5,7 +5,9 @@ import jax.numpy as jnp
 
 from mjx_revolve.episodes import make_functional_env
 
-env = make_functional_env("fish_swim", **{"task.duration": 2.0, "task.settle": 0.5})
+env = make_functional_env(
+    "fish_swim", **{"task.duration": 2.0, "task.settle": 0.5, "task.horizon": None}
+)
 steps = env.environment.num_steps
 
 

@@ -8,7 +8,10 @@ from ribs.schedulers import Scheduler
 
 from mjx_revolve import make_fitness
 
-fitness = make_fitness("lake_swim", **{"task.duration": 4.0, "task.settle": 1.0, "task.trials": 1})
+fitness = make_fitness(
+    "lake_swim",
+    **{"task.duration": 4.0, "task.settle": 1.0, "task.horizon": None, "task.trials": 1},
+)
 archive = GridArchive(
     solution_dim=fitness.num_genes, dims=(10, 10), ranges=[(0, 1), (0, 2)],
     learning_rate=0.01, threshold_min=-1.0,

@@ -12,7 +12,10 @@ from qdax.utils.metrics import default_qd_metrics
 
 from mjx_revolve import make_fitness
 
-fitness = make_fitness("lake_swim", **{"task.duration": 4.0, "task.settle": 1.0, "task.trials": 1})
+fitness = make_fitness(
+    "lake_swim",
+    **{"task.duration": 4.0, "task.settle": 1.0, "task.horizon": None, "task.trials": 1},
+)
 
 
 def score(genes, key):

@@ -67,9 +67,7 @@ def tree(body: Morphology) -> list[tuple[tuple[int, ...], str, float]]:
     paths: list[tuple[int, ...]] = [()]
     for module in body.modules[1:]:
         paths.append((*paths[module.parent], module.slot))
-    return [
-        (path, m.type, m.orientation) for path, m in zip(paths[1:], body.modules[1:], strict=True)
-    ]
+    return [(path, m.type, m.orientation) for path, m in zip(paths, body.modules, strict=True)][1:]
 
 
 def face_drag(robot: Robot) -> FaceNumbers:

@@ -9,10 +9,7 @@ import pytest
 from mjx_revolve.water.bed import bed_height
 
 # A cube cut into six tetrahedra around one diagonal (Kuhn): corners as indices into (0, 1)³.
-_KUHN = [
-    [np.zeros(3), *np.cumsum(np.eye(3)[list(order)], axis=0)]
-    for order in itertools.permutations(range(3))
-]
+_KUHN = [[np.zeros(3), *np.cumsum(axes, axis=0)] for axes in itertools.permutations(np.eye(3))]
 
 
 def _tetrahedron_below(corners, height):

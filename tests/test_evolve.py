@@ -139,9 +139,8 @@ def test_a_run_that_has_lost_its_checkpoints_does_not_begin_anew(folder, capsys)
     before = (folder / "run" / "metrics.csv").read_text()
     shutil.rmtree(folder / "run" / "checkpoints")
     assert run_main("--resume", "run", "--set", "evolution.generations=9") == 2
-    assert "checkpoints: expected a checkpoint to resume from; found none" in (
-        capsys.readouterr().err
-    )
+    error = capsys.readouterr().err
+    assert "checkpoints: expected a checkpoint to resume from; found none" in error
     assert (folder / "run" / "metrics.csv").read_text() == before
 
 
@@ -178,17 +177,15 @@ def test_a_run_stays_the_same_run(stopped, argv, message, capsys):
 def test_a_changed_robot_or_config_is_noticed(stopped, capsys, monkeypatch):
     monkeypatch.setattr(beginning, "model_hash", lambda fitness: "another")
     assert run_main("--resume", "run") == 2
-    assert "expected the robot and the world that it began with; found them changed" in (
-        capsys.readouterr().err
-    )
+    error = capsys.readouterr().err
+    assert "expected the robot and the world that it began with; found them changed" in error
     monkeypatch.undo()
     monkeypatch.chdir(stopped)
     path = stopped / "run" / "config.yaml"
     path.write_text(path.read_text().replace("duration: 10.0", "duration: 9.0"))
     assert run_main("--resume", "run") == 2
-    assert "expected the config.yaml that it began with; found it changed" in (
-        capsys.readouterr().err
-    )
+    error = capsys.readouterr().err
+    assert "expected the config.yaml that it began with; found it changed" in error
 
 
 @pytest.mark.parametrize(

@@ -14,12 +14,8 @@ from mjx_revolve.schema import FOLDER, KINDS, make_schema, show_schema
 
 jsonschema = pytest.importorskip("jsonschema", reason="it checks files against schemas")
 
-FILES = [
-    *(ROOT / "configs").glob("*.yaml"),
-    *(ROOT / "morphologies").glob("*.yaml"),
-    *(ROOT / "experiments").glob("*.yaml"),
-    *(ROOT / "mjx_revolve" / "water" / "worlds").glob("*.yaml"),
-]
+FOLDERS = ("configs", "morphologies", "experiments", "mjx_revolve/water/worlds")
+FILES = [path for folder in FOLDERS for path in (ROOT / folder).glob("*.yaml")]
 
 
 @pytest.fixture(scope="module")

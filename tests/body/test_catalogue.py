@@ -209,9 +209,7 @@ def test_own_types_are_read(tmp_path):
     holder, blade = fin.parts
     assert holder.volume == pytest.approx(0.022 * 0.036 * 0.010)
     # The end plate reaches from .029 to .031: half of it is inside the blade.
-    assert blade.volume == pytest.approx(
-        0.06 * 0.04 * 0.002 + 0.04 * (0.002 * 0.01 - 0.001 * 0.002)
-    )
+    assert blade.volume == pytest.approx(0.04 * (0.06 * 0.002 + 0.002 * 0.01 - 0.001 * 0.002))
     assert (blade.drag_coefficient, blade.contact) == (1.9, True)
     assert ring.parts[0].name == "part0"
     assert (ring.parts[0].volume, ring.parts[0].contact) == (3e-5, False)

@@ -88,10 +88,7 @@ def test_a_network_by_hand(robot):
     found = play(robot, None, 100, felt())
     mix = total = clock = 0.0
     for k in range(100):
-        due = [
-            i for i in range(100) if i == 0 or int(i * DT * 8 + 0.01) > int((i - 1) * DT * 8 + 0.01)
-        ]
-        if k in due:
+        if k == 0 or int(k * DT * 8 + 0.01) > int((k - 1) * DT * 8 + 0.01):
             wave = (np.sin(2 * np.pi / 0.8 * (k * DT - 0.8 * 0.3)) + 1) / 2
             activity = 0.2 * 3.0 - 0.7 * 0.5 + 1.5 * total
             weighted = 0.5 * 0.6 + 0.4 * clock + 0.3 * mix - 0.25 * total

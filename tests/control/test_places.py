@@ -244,10 +244,8 @@ def test_types_of_modules_bring_their_sensors(tmp_path):
     assert resolve_sensors(None, MODULES) is None
     # An alias is as good as a name; what is no type is refused, and so is one name twice.
     assert resolve_sensors([Sensor(type="gyro", each="CoreComponent")], MODULES)[0].each == "Core"
-    with pytest.raises(
-        InputError, match=r"config: sensors.0.each: expected a type of modules, one"
-    ):
-        resolve_sensors([Sensor(type="gyro", each="Brick")], MODULES)
+    message = "config: sensors.0.each: expected a type of modules, one"
+    lab.check_refused(message, resolve_sensors, [Sensor(type="gyro", each="Brick")], MODULES)
     with pytest.raises(InputError, match=r"config: sensors.2.name: expected names that differ"):
         resolve_sensors([Sensor(type="tilt", name="turn")], modules)
     (tmp_path / "modules.yaml").write_text(FISHY.replace("type: gyro", "type: angle"))

@@ -164,9 +164,7 @@ def test_an_accelerometer_in_a_spinning_vacuum_is_mujocos():
             ctrl = jnp.zeros((0, 1))
             new, _ = engine.step(state, ctrl, water)
             memory = update_memory(memory, engine.root(state), engine.root(new), ctrl, 0.0, 1e-5)
-            return read_sensors(
-                tank, engine, new, water, jnp.zeros(()), EpisodeContext(), memory
-            ).force
+            return read_sensors(tank, engine, new, water, 0.0, EpisodeContext(), memory).force
 
         found = jax.jit(run, compiler_options=QUICK)(jnp.asarray(qpos), jnp.asarray(qvel))
     assert np.concatenate(found) == pytest.approx(data.sensordata, abs=1e-3)

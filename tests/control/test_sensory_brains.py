@@ -147,9 +147,7 @@ def test_the_shared_network_by_hand(recurrent):
     slope = [np.pi * np.sin(named[f"phase {x}"]) for x in ("x", "y", "z", "away")]
     late = np.column_stack([place, away]) @ slope
     rate = 2 * np.pi * 2.0 * (1 + np.sin(named["frequency"])) / 2
-    sense = SensorReadings(
-        np.array([0.3]), np.array([0.4]), (), (), angle=np.array([[0.5], [-0.2]])
-    )
+    sense = SensorReadings(np.array([0.3]), np.array([0.4]), (), (), angle=np.c_[[0.5, -0.2]])
     found = targets(controller, plant, genes, 120, sense)[..., 0]
     said, memory = np.zeros(2), np.zeros((2, 3))
     units = range(1, 4)
@@ -256,8 +254,6 @@ def test_splines_go_through_their_points():
         genes = drawn(controller, seed=points, scale=0.4)
         genes[-1] = 0.0  # 1 Hz
         found = targets(controller, plant, genes, 400, sense_of(2), start=200)[..., 0]
-        through = np.sin(genes[:-1, 0]).reshape(points, 2)
-        curve = CubicSpline(
-            np.arange(points + 1) / points, [*through, through[0]], bc_type="periodic"
-        )
+        knots = np.sin(genes[:-1, 0]).reshape(points, 2)
+        curve = CubicSpline(np.arange(points + 1) / points, [*knots, knots[0]], bc_type="periodic")
         assert found == pytest.approx(REACH * curve((DT * np.arange(200, 600)) % 1), abs=1e-9)

@@ -134,11 +134,9 @@ def test_robots_side_by_side_have_the_bits_that_each_has_alone():
     packed = pack_bodies(chosen, capacity, np.float64)
     assert (together.robot[together.roots] == np.arange(len(chosen))).all()
     for k, robot in enumerate(chosen):
-        bodies = np.flatnonzero(together.robot == k)
+        rows = np.flatnonzero(together.robot == k)
         for name in ("mass", "center", "inertia", "position", "rotation", "stiffness"):
-            assert np.array_equal(
-                getattr(together, name)[bodies], getattr(robot.assembly, name)[1:]
-            )
+            assert np.array_equal(getattr(together, name)[rows], getattr(robot.assembly, name)[1:])
         parts = together.layout.body == k
         for name in ("position", "exposed", "silhouette", "carried_mass"):
             assert np.array_equal(getattr(together.fluid, name)[parts], getattr(robot.fluid, name))

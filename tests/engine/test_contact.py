@@ -43,11 +43,8 @@ def test_force_on_a_point():
     normal = draw.normal(size=(3, 500))
     normal /= np.linalg.norm(normal, axis=0)
     velocity = draw.normal(size=(3, 500))
-    force = np.stack(
-        bed_contact(
-            FLAT, jnp.asarray(depth), tuple(normal), tuple(map(jnp.asarray, velocity)), 0.01, 0.005
-        )[0]
-    )
+    moved = tuple(map(jnp.asarray, velocity))
+    force = np.stack(bed_contact(FLAT, jnp.asarray(depth), tuple(normal), moved, 0.01, 0.005)[0])
     outward = (force * normal).sum(0)
     sliding = force - outward * normal
     slip = velocity - (velocity * normal).sum(0) * normal

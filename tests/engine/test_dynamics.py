@@ -145,9 +145,7 @@ def test_slanted_modules_have_our_water():
             twist += np.cross(moment + share * center, lift)
             force = force + jacobians[0].T @ axes @ push + jacobians[1].T @ axes @ twist
         expected = np.linalg.solve(mass, force)
-        assert found[:, lane] == pytest.approx(
-            expected, rel=1e-9, abs=1e-9 * np.abs(expected).max()
-        )
+        assert found[:, lane] == pytest.approx(expected, rel=1e-9, abs=1e-9 * abs(expected).max())
 
 
 def test_several_children_upon_one_of_several_equal_links():

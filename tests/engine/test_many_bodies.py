@@ -424,33 +424,18 @@ def test_genes_find_their_joints_again(fitness):
 
 def test_what_it_cannot_do_is_refused_by_name(config, fitness):
     tank = world(**WATER)
-    snakes = fit_capacity([build_robot(body("snake"), tank)])
-    zeros = np.zeros((2, fitness.num_genes))
-    cases = [
-        (lambda: fit_capacity([]), "robots: expected at least one; found none"),
-        (
-            lambda: pack_bodies([build_robot(body("auv"), tank)], snakes),
-            "'auv': expected parts under one of the laws [('partial', 'faces', False)]",
-        ),
-        (
-            lambda: pack_bodies([build_robot(random_body(1, 9), tank)], snakes),
-            "'random_1': expected at most 8 hinges; found 9",
-        ),
-        (
-            lambda: make_mixed_fitness(config, [body("snake")], engine="mjx"),
-            "engine: expected population, as bodies differ; found mjx",
-        ),
-        (
-            lambda: fitness([fitness.build(body("snake"))], zeros, None),
-            "robots: expected 2, one each; found 1",
-        ),
-        (
-            lambda: fitness([body("snake")], zeros[:1], None),
-            "robots: expected what `build` returns; found Morphology",
-        ),
-    ]
-    for make, message in cases:
-        check_refused(message, make)
+    snake, zeros = body("snake"), np.zeros((2, fitness.num_genes))
+    auv, many, only = ([build_robot(x, tank)] for x in (body("auv"), random_body(1, 9), snake))
+    snakes, built = fit_capacity(only), [fitness.build(snake)]
+    check_refused("robots: expected at least one; found none", fit_capacity, [])
+    laws = "'auv': expected parts under one of the laws [('partial', 'faces', False)]"
+    check_refused(laws, pack_bodies, auv, snakes)
+    check_refused("'random_1': expected at most 8 hinges; found 9", pack_bodies, many, snakes)
+    engine = "engine: expected population, as bodies differ; found mjx"
+    check_refused(engine, make_mixed_fitness, config, [snake], engine="mjx")
+    check_refused("robots: expected 2, one each; found 1", fitness, built, zeros, None)
+    kind = "robots: expected what `build` returns; found Morphology"
+    check_refused(kind, fitness, [snake], zeros[:1], None)
 
 
 def test_constants_follow_from_the_types_of_modules_not_from_examples():

@@ -49,17 +49,13 @@ class Mirror:
 
     def pose(self, qpos):
         """`[..., nq]`; a quaternion's vector part is mirrored as a spin is."""
-        moved, w, spun = qpos[..., :3], qpos[..., 3:4], qpos[..., 4:7]
-        return np.concatenate(
-            [moved * self.flip, w, -spun * self.flip, self.hinges(qpos[..., 7:])], -1
-        )
+        moved, w, spun = qpos[..., :3] * self.flip, qpos[..., 3:4], -qpos[..., 4:7] * self.flip
+        return np.concatenate([moved, w, spun, self.hinges(qpos[..., 7:])], -1)
 
     def velocity(self, qvel):
         """`[..., nv]`."""
-        moved, spun = qvel[..., :3], qvel[..., 3:6]
-        return np.concatenate(
-            [moved * self.flip, -spun * self.flip, self.hinges(qvel[..., 6:])], -1
-        )
+        moved, spun = qvel[..., :3] * self.flip, -qvel[..., 3:6] * self.flip
+        return np.concatenate([moved, spun, self.hinges(qvel[..., 6:])], -1)
 
 
 @lru_cache(maxsize=8)

@@ -76,9 +76,7 @@ def test_a_servo_is_as_stiff_at_every_step(timestep):
         torque, inertia = servo(hinges, still, still, target, timestep, still + 1e-4, still)
         effort = np.broadcast_to(hinges.effort[1], (level.count, 1))[:, 0]
         stiffness = effort / FULL_TORQUE_ERROR
-        assert np.asarray(torque) == pytest.approx(
-            np.stack([stiffness * 0.02, effort], 1), rel=1e-5
-        )
+        assert np.asarray(torque) == pytest.approx(np.c_[stiffness * 0.02, effort], rel=1e-5)
         rest = np.broadcast_to(hinges.implicit_stiffness, (level.count, 1))[:, 0]
         assert (np.asarray(inertia)[:, 0] >= 0.36 * timestep**2 * rest * (1 - 1e-6)).all()
 

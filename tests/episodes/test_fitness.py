@@ -102,9 +102,7 @@ def track(x, z=None, clearance=1.0, drift=0.0):
     """One individual that moves along x in steps of 1 s, in water that does, too [m/s]."""
     rows, z = np.ones(len(x)), np.zeros(len(x)) if z is None else z
     water = np.outer(rows, [drift, 0, 0])
-    return make_track(
-        np.stack([x, 0 * rows, z], 1), clearance=clearance * rows, water_velocity=water
-    )
+    return make_track(np.c_[x, 0 * rows, z], clearance=clearance * rows, water_velocity=water)
 
 
 def turned(yaws, roll=0.3):

@@ -223,10 +223,8 @@ def test_both_precisions_in_one_process(engine, first):
     def program(robot, controller, kind):
         def end(genes):
             qpos = jnp.asarray(robot.qpos0).at[2].set(-0.005)
-            trajectory = simulate(
-                robot, bind_genes(controller, genes), 4 * DT, qpos=qpos, engine=engine
-            )
-            return jnp.sum(trajectory.qpos[-1] ** 2)
+            found = simulate(robot, bind_genes(controller, genes), 4 * DT, qpos=qpos, engine=engine)
+            return jnp.sum(found.qpos[-1] ** 2)
 
         with jax.enable_x64(kind == "float64"):
             jitted = jax.jit(end)

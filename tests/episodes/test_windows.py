@@ -86,13 +86,9 @@ def test_closed_loop_gradients_are_those_of_differences(whole, kind):
 def brain(settings):
     """A recurrent network with samples that are held and late, gusts and waves around it."""
     sensors = ["tilt", {"type": "gyro", "rate": 20, "delay": 0.1}, "flow", "load"]
-    world = {
-        "name": "lake",
-        "gust": {"std": 0.1},
-        "waves": [{"amplitude": 0.05, "wavelength": 2.0}],
-    }
+    sea = {"name": "lake", "gust": {"std": 0.1}, "waves": [{"amplitude": 0.05, "wavelength": 2.0}]}
     controller = {"type": "rnn", "sensors": sensors, "hidden": 3}
-    return make_fitness(settings | {"controller": controller, "world": world})
+    return make_fitness(settings | {"controller": controller, "world": sea})
 
 
 @pytest.fixture(scope="module")

@@ -64,12 +64,8 @@ def workers_of(pid):
         if entry.name.isdigit():
             with contextlib.suppress(OSError):
                 state, parent = (entry / "stat").read_text().rpartition(")")[2].split()[:2]
-                command_line = (entry / "cmdline").read_bytes()
-                if (
-                    int(parent) == pid
-                    and state != "Z"
-                    and b"mjx_revolve.evolution.processes" in command_line
-                ):
+                ours = b"mjx_revolve.evolution.processes" in (entry / "cmdline").read_bytes()
+                if ours and int(parent) == pid and state != "Z":
                     found.append(int(entry.name))
     return sorted(found)
 

@@ -366,11 +366,9 @@ def test_morphologies_and_configurations_name_what_was_fitted(fitted, tmp_path):
     config = load_config("lake_swim", overrides={"coefficients": str(tmp_path / "water.yaml")})
     assert read_modules(config)["Core"].parts[0].factors == robot.modules[0].kind.parts[0].factors
     water = load_world("lake")
-    plain = build_robot(make_morphology(tree), water).fluid
-    mine = build_robot(robot, water).fluid
-    np.testing.assert_allclose(
-        mine.carried_mass, fitted.values[1].value * plain.carried_mass, rtol=1e-6
-    )
+    plain = build_robot(make_morphology(tree), water).fluid.carried_mass
+    mine = build_robot(robot, water).fluid.carried_mass
+    np.testing.assert_allclose(mine, fitted.values[1].value * plain, rtol=1e-6)
 
 
 def write_csv(path, columns):

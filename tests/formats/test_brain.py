@@ -381,9 +381,7 @@ def test_places_past_the_end_and_robots_without_hinges(spider):
     def steer(parameters, state, time, sense):
         rows = sense.angle.shape[0]
         felt = jnp.sum(sense.angle, 0) + (jnp.ones((1, rows)) @ sense.angle)[0]
-        return state, jnp.concatenate(
-            [2 * sense.angle, sense.up[0] + felt[None] + jnp.ones((4, 1))]
-        )
+        return state, jnp.vstack([2 * sense.angle, sense.up[0] + felt[None] + jnp.ones((4, 1))])
 
     still = build_robot(body("auv"), load_world("lake"))
     for robot, step, given, expected in (

@@ -116,9 +116,7 @@ def test_mjcf_and_sdf_start_where_the_rollout_does(tmp_path):
 
 
 def test_mjcf_has_the_current_and_a_near_bed():
-    world = load_world(
-        "empty_underwater", current=(0.1, 0, 0.2), bed={"kind": "flat", "height": -1.02}
-    )
+    world = load_world("empty_underwater", current=(0.1, 0, 0.2), bed={"height": -1.02})
     robot = build_robot(body("spider"), world)
     model = load_mjcf(robot)
     np.testing.assert_allclose(model.opt.wind, [0.1, 0, 0.2])

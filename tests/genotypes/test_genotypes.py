@@ -188,9 +188,8 @@ def test_the_space_says_what_it_refuses():
     few = replace(loose, max_of={"FixedBrick": 7})
     assert few.refuses(spider) == "expected at most 7 FixedBrick (max_of); found 8"
     assert replace(loose, accepts=lambda body: False).refuses(spider) is not None
-    assert "found 'ActiveHinge'" in replace(loose, catalogue={"Core": MODULES["Core"]}).refuses(
-        spider
-    )
+    bare = replace(loose, catalogue={"Core": MODULES["Core"]})
+    assert "found 'ActiveHinge'" in bare.refuses(spider)
 
 
 def test_spaces_are_made_of_types_that_there_are():
@@ -213,12 +212,10 @@ def test_spaces_are_made_of_types_that_there_are():
     assert refused(max_of={"Fin": 1}) == (
         "bodies.max_of: expected any of bodies.modules, FixedBrick, ActiveHinge; found Fin"
     )
-    assert make_space(config(modules=ALL, max_of={"FixedBrickSensor": 1}), MODULES).max_of == {
-        "TouchSensor": 1
-    }
-    assert make_space(config(modules=("FixedBrick",), min_hinges=0), MODULES).modules == (
-        "FixedBrick",
-    )
+    aliased = make_space(config(modules=ALL, max_of={"FixedBrickSensor": 1}), MODULES)
+    assert aliased.max_of == {"TouchSensor": 1}
+    bricks = make_space(config(modules=("FixedBrick",), min_hinges=0), MODULES)
+    assert bricks.modules == ("FixedBrick",)
 
 
 # A type whose slots look in directions that are not the core's axes, so that boxes stand askew.

@@ -29,9 +29,7 @@ RULES = {"C": ("C", "addf", "AJ1", "moveb"), "AJ1": ("AJ1", "addf", "B"), "B": (
 def test_each_letter_stands_for_one_thing():
     brick = replace(MODULES["FixedBrick"], name="B")
     with pytest.raises(InputError, match="found 'B' of B, which stands for something else"):
-        make_alphabet(
-            replace(SPACE, catalogue={**MODULES, "B": brick}, modules=("FixedBrick", "B"))
-        )
+        make_alphabet(replace(SPACE, catalogue=MODULES | {"B": brick}, modules=("FixedBrick", "B")))
 
 
 def test_a_sentence_grows_by_its_rules():

@@ -426,8 +426,6 @@ def test_checkpoints_that_hold_something_else(folder, whole, name, data):
             if how == "type":
                 arrays[name] = arrays[name].astype(kind)
             else:
-                arrays[name] = np.full_like(
-                    arrays[name], np.float64(value).astype(arrays[name].dtype)
-                )
+                arrays[name] = np.full_like(arrays[name], np.float64(value))
     np.savez(path, **arrays)
     look_around(folder)

@@ -159,9 +159,7 @@ def test_wrong_controllers(folder, old, new, message):
 
 def test_a_run_keeps_the_code(folder):
     config = load_config("swim.yaml")
-    run, kept = runs.create_run_folder(
-        "run", config, config_file=str(folder / "swim.yaml"), settings=[]
-    )
+    run, kept = runs.create_run_folder("run", config, config_file=config.source, settings=[])
     run.close()
     copy = folder / "run" / "inputs" / "own.py"
     assert copy.read_text() == OWN

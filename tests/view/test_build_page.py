@@ -137,9 +137,7 @@ def test_shapes_are_closed_and_in_millimetres(page):
         mesh = trimesh.load(io.BytesIO(base64.b64decode(source)), file_type="stl")
         # Bodies that touch share edges: closed is what has each edge as often both ways.
         edges = np.round(1e3 * mesh.vertices)[mesh.edges].astype(int)
-        there, back = (
-            sorted(map(tuple, x.reshape(-1, 6).tolist())) for x in (edges, edges[:, ::-1])
-        )
+        there, back = (sorted(x.reshape(-1, 6).tolist()) for x in (edges, edges[:, ::-1]))
         assert there == back
         assert mesh.volume == pytest.approx(1e9 * own.volume, rel=1e-4)
         low, high = own.bounds

@@ -168,8 +168,6 @@ def test_sum_is_what_the_step_does(laws):
     forces = module_forces(robot, states(robot, qpos.T, qvel.T))
     total = (forces.buoyancy + forces.drag + forces.thrust).sum(1)
     total[:, 2] -= robot.mj_model.body_subtreemass[1] * G
-    expected = [
-        _momentum_rate(robot, q, v, a)
-        for q, v, a in zip(qpos.T, qvel.T, acceleration.T, strict=True)
-    ]
+    motions = zip(qpos.T, qvel.T, acceleration.T, strict=True)
+    expected = [_momentum_rate(robot, *motion) for motion in motions]
     assert total == pytest.approx(np.array(expected), rel=1e-3, abs=2e-4)

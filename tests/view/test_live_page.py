@@ -238,9 +238,8 @@ def test_malformed_commands(served):
         assert status == 400 and "\n" not in answer["error"], data
         assert "expected" in answer["error"]
     assert command(served, "x" * 5000)[0] == 400
-    assert command(served, {"do": "drop", "entry": 99})[1]["error"].startswith(
-        "drop.entry: expected"
-    )
+    error = command(served, {"do": "drop", "entry": 99})[1]["error"]
+    assert error.startswith("drop.entry: expected")
 
 
 def test_commands_are_done(served):
@@ -376,6 +375,4 @@ def test_a_user_plays(served):
         assert served.simulation.paused
         assert browser.errors == []
         ours = served.origins[0]
-        assert all(
-            address.startswith(ours) for address in browser.requests if "about:" not in address
-        )
+        assert all(url.startswith(ours) for url in browser.requests if "about:" not in url)

@@ -72,9 +72,8 @@ def test_rows_after_the_first_that_is_not_finite_are_left_out(elbow, sine):
 
 def test_a_task_counts_from_its_first_record():
     # Records every 0.1 s, the first of them one interval late: 2.0 s are the rows 0 to 19.
-    assert counted_time(
-        TaskConfig(type="speed", duration=10.0, settle=2.0), 0.005
-    ) == pytest.approx(2.1)
+    task = TaskConfig(type="speed", duration=10.0, settle=2.0)
+    assert counted_time(task, 0.005) == pytest.approx(2.1)
 
 
 def test_poses_are_spread_over_the_way():

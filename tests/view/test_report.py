@@ -439,8 +439,7 @@ def test_a_page_about_what_is_left(copy, quick, capsys):
     for path in (copy.parent / "d").iterdir():
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     assert run_main("a", "b", "c", "d") == 0
-    captured = capsys.readouterr()
-    lines = captured.err.splitlines()
+    lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 4
     assert lines[0] == (
         "warning: nothing could be read: d: expected a run folder; found nothing of a run"

@@ -39,10 +39,8 @@ def made_up(robot, duration: float = 10.0) -> Trajectory:
     """A swim that nothing simulated: ahead along x at a constant speed, all hinges waving."""
     model = robot.mj_model
     time = DT * np.arange(1, round(duration / DT) + 1)
-    qpos, qvel = (
-        np.repeat(robot.start_qpos(2.0)[None], len(time), 0),
-        np.zeros((len(time), model.nv)),
-    )
+    qpos = np.repeat(robot.start_qpos(2.0)[None], len(time), 0)
+    qvel = np.zeros((len(time), model.nv))
     qpos[:, 0], qvel[:, 0] = SPEED * time, SPEED
     turn = 0.3 * np.sin(time)
     qpos[:, 3], qpos[:, 6], qvel[:, 5] = np.cos(turn / 2), np.sin(turn / 2), 0.3 * np.cos(time)

@@ -59,9 +59,7 @@ def attitudes(n, seed=0):
 
 
 # Level, on edge and on corner, where the heights of edges vanish or are equal; signs too.
-SPECIAL = [
-    np.array(n) / np.linalg.norm(n) for n in itertools.product((0.0, -1.0, 1.0), repeat=3) if any(n)
-]
+SPECIAL = [n / np.linalg.norm(n) for n in itertools.product((0.0, -1.0, 1.0), repeat=3) if any(n)]
 
 
 def assert_exact(up, depth, half):

@@ -72,9 +72,7 @@ def test_a_compact_part_has_the_drag_of_its_faces_by_default(size):
 
 def test_a_lone_rod_is_a_chain_that_sheds_nothing():
     """In oblique flow, along it, spinning about its middle; in between, some of it."""
-    rod, shorter = (
-        box_robot((length, 0.1, 0.1), 1000 * length * 0.01, WATER) for length in (1.0, 0.1 / 0.3)
-    )
+    rod, shorter = (box_robot((x, 0.1, 0.1), 1000 * x * 0.01, WATER) for x in (1.0, 0.1 / 0.3))
     assert shares_of(rod.fluid) == [1.0]
     numbers = CROSS_FLOW.numbers(rod.fluid, WATER)
     assert np.abs(numbers.along).tolist() == [[1, 0, 0]]

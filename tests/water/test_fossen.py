@@ -169,11 +169,8 @@ def test_different_bodies_side_by_side_and_gradients():
     limb = read(
         f"body: {{type: Core, children: {{1: {{type: FixedBrick, params: {{fossen: {damped}}}}}}}}}"
     )
-    robots = [
-        build_robot(limb, tank),
-        box_robot(SIZE, MASS, tank),
-        box_robot(SIZE, MASS, tank, fossen=STATED),
-    ]
+    boxes = [box_robot(SIZE, MASS, tank, **more) for more in ({}, {"fossen": STATED})]
+    robots = [build_robot(limb, tank), *boxes]
     capacity = fit_capacity(robots)
     qpos, qvel = at_rest(robots[0], 3, -5.0)
     qvel[:6] = np.random.default_rng(0).normal(size=(6, 3))
@@ -206,9 +203,8 @@ def test_a_bluerov2_is_the_published_one():
     assert body.center_of_mass == pytest.approx([0, 0, 0], abs=1e-6)
     assert body.center_of_volume == pytest.approx([0, 0, 0.01], abs=1e-5)
     assert sorted(model.body_inertia[1]) == pytest.approx([0.23, 0.26, 0.37], rel=1e-4)
-    assert robot.world.density * robot.fluid.carried_mass.sum(0) == pytest.approx(
-        [6.3567, 7.1206, 18.6863]
-    )
+    carried = robot.world.density * robot.fluid.carried_mass.sum(0)
+    assert carried == pytest.approx([6.3567, 7.1206, 18.6863])
     curve = MODULES["T200"].parts[0].thruster
     assert [curve.thrust_at(x) for x in (-1, 0, 1)] == [-39.92, 0, 51.45]
     # Ahead: bow thrusters push, stern ones pull; below the centre of mass, so it noses up.

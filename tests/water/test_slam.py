@@ -19,9 +19,8 @@ SIZE = np.array([0.2, 0.1, 0.06])
 
 @lru_cache
 def _cut(half, mode):
-    return jax.jit(
-        lambda up, depth: BUOYANCY_LAWS[mode].submersion(up, depth, half), compiler_options=QUICK
-    )
+    law = BUOYANCY_LAWS[mode]
+    return jax.jit(lambda up, depth: law.submersion(up, depth, half), compiler_options=QUICK)
 
 
 def wetness(qpos, mode="partial"):

@@ -65,12 +65,8 @@ def test_the_least_motion_changes_neither_force_nor_gradient():
     """Share and reach of the wake are ratios, which what turns about its middle has not."""
     slat = numbers_of(PLATE_WAKE, box_robot((0.002, 0.03, 0.3), 0.5, WATER))
     law = lambda memory, *v: PLATE_WAKE.force(PartFlow(*v, 1.0, memory), slat, WATER)  # noqa: E731
-    spin, side, still, little = (
-        (0.0, 3.0, 0.0),
-        jnp.array((0, 0.2, 0)),
-        (0.0,) * 4,
-        (1e-9, 0.0, 0.0),
-    )
+    spin, side = (0.0, 3.0, 0.0), jnp.array((0, 0.2, 0))
+    still, little = (0.0,) * 4, (1e-9, 0.0, 0.0)
     moved, _ = past(PLATE_WAKE, slat, [little] * 50, 0.005)
     expected = law(still, (0.0,) * 3, spin).torque[1]
     np.testing.assert_allclose(law(moved, little, spin).torque[1], expected, rtol=1e-6)

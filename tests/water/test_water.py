@@ -188,11 +188,7 @@ def test_waves_are_carried_by_the_worlds_current():
     (Shear((1, 2, 0), 4.0), [-1, 0, 1, 2, 3.9, 4, 9], [1, 1, 0.75, 0.5, 0.025, 0, 0]),
     (Shear((1, 2, 0), 4.0, "power", 0.5), [-1, 0, 3, 3.75, 4, 9], [1, 1, 0.5, 0.25, 0, 0]),
     (Shear((1, 2, 0), 4.0, "power"), [0, 2, 4], [1, 0.5 ** (1 / 7), 0]),
-    (
-        Shear((1, 2, 0), 4.0, "exponential"),
-        [-1, 0, 4, 8, 400],
-        [1, 1, np.exp(-1), np.exp(-2), np.exp(-100)],
-    ),
+    (Shear((1, 2, 0), 4.0, "exponential"), [-1, 0, 4, 8, 400], [1, 1, *np.exp([-1, -2, -100])]),
 ])  # fmt: skip
 def test_shear_profiles(shear, depth, share):
     """On top of the uniform current, below a surface that need not be at 0."""
