@@ -154,7 +154,8 @@ class SensorReadings(NamedTuple):
         noise: seed of sensor noise, uint32 `[lanes]`; core only.
         force: specific force, the mean acceleration over the last step less gravity's [m/s²];
             optional: see `OPTIONAL_SIGNALS`.
-        load: torque of the servos under the last command, as `angle` [N·m]; optional.
+        load: torque of the servos under the last command at the angle now, as `angle` [N·m];
+            optional.
         work: done by servos and propellers so far [J]; core only, optional.
         touch: force of contacts on the core's rigid body, then on the body that each hinge moves,
             `[1 + hinge rows, lanes]` [N]; at a module that on its rigid body; optional.
