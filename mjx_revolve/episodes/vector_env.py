@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
+from enum import Enum
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -246,7 +247,7 @@ def make_vector_env(
     *,
     sensors: Sequence[object] | None = None,
     control_rate: float | None = None,
-    autoreset_mode: str = "NextStep",
+    autoreset_mode: str | Enum = "NextStep",
     **overrides: object,
 ) -> Any:
     """A `gymnasium.vector.VectorEnv` of a configuration: its robot, its water, its task.
@@ -281,7 +282,8 @@ def make_vector_env(
     whole = isinstance(num_envs, int | np.integer) and not isinstance(num_envs, bool)
     if not whole or num_envs < 1:
         raise InputError("num_envs", "a whole number >= 1", repr(num_envs))
-    autoreset_mode = getattr(autoreset_mode, "value", autoreset_mode)  # Gymnasium's `AutoresetMode`
+    if isinstance(autoreset_mode, Enum):
+        autoreset_mode = autoreset_mode.value
     if autoreset_mode not in AUTORESET_MODES:
         known = f"one of {', '.join(AUTORESET_MODES)}"
         raise InputError("autoreset_mode", known, repr(autoreset_mode))
