@@ -324,7 +324,7 @@ NOISY = {
 @pytest.mark.parametrize(
     ("kind", "other", "tank", "task", "checked"),
     [
-        ("own", "snake", {"name": "lake", "bed": {"kind": "flat", "height": -3.0}}, CRAWL, 0),
+        ("own", "fish", {"name": "lake", "bed": {"kind": "flat", "height": -3.0}}, CRAWL, 0),
         ("feedback", "auv", {"name": "lake", "gust": {"std": 0.05, "time": 2.0}},
          {"task.trials": 2, "task.robust": {"motor": 2.0}}, 1),
         ("cpg", "fish", {"name": "lake", "waves": [{"amplitude": 0.02, "wavelength": 1.0}]}, {}, 1),

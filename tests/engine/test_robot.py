@@ -191,7 +191,7 @@ def test_an_edited_model_is_a_new_robot(kind):
 
 
 def test_a_servo_without_a_limit_has_a_gradient():
-    robot = build_robot(body("snake"), world())
+    robot = build_robot(body("fish"), world())
     edit = copy.copy(robot.mj_model)
     edit.actuator_forcelimited[:], edit.body_mass[:] = 0, 2 * edit.body_mass
     edited = robot.with_model(edit)
