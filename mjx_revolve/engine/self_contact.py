@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import reduce
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -48,9 +49,9 @@ from mjx_revolve.numerics.xla import fuse, materialize, on_cpu, take_lanes
 _MOST = 8
 # Robots that are tested together: loops last as long as the robot with the most pairs and contacts
 # needs, so that 256 random bodies step a third faster by fours than by eights; one at a time is a
-# third slower where all touch. Pairs of spheres, and of boxes, that are compared at a time: enough
-# for vector registers. Choices.
-_ROBOTS, _SPHERES, _PAIRS = 4, 32, 16
+# third slower where all touch. Tables of one body need no copies: eights are a tenth faster there.
+# Pairs of spheres, and of boxes, that are compared at a time: enough for vector registers. Choices.
+_ROBOTS, _ALIKE, _SPHERES, _PAIRS = 4, 8, 32, 16
 # Pairs that are near which are listed at a time, where loops need no known length. A choice.
 _ROOM = 256
 # Flags in a word.
@@ -130,7 +131,7 @@ def contact_acceleration(
     """
     lanes, dtype, steady = len(clearance), clearance.dtype, meetings.steady
     wanted = (clearance < 0) & (meetings.count > 0)
-    size = min(_ROBOTS, lanes)
+    size = min(_ROBOTS if meetings.lanes > 1 else _ALIKE, lanes)
     most = -(-lanes // size)
     # One array: XLA:CPU aborts over a loop of which a part is not used, as the clearance would be
     # where a caller returns positions only.
@@ -194,7 +195,8 @@ def _settle(
     def look_again(now: Any) -> Any:
         contacts, clear, moving, first = now
         change = contacts.acceleration()[6:] - first * robots.hurry
-        frames = robots.pose(steps + dt**2 * change)
+        # Within a loop only what is fused by itself is computed once.
+        frames = fuse(robots.pose, inline=True)(steps + dt**2 * change)
         kept = weight(contacts.force > 0, clear)
         drift = first * robots.drift
         table = find(meetings, which, moving > 0, frames, kept, drift, dt, halves)
@@ -351,7 +353,8 @@ def _find_contacts(
     cells = (
         jnp.asarray(meetings.halves.T, dtype) if halves and meetings.halves is not None else None
     )
-    spheres = _spheres(meetings, which, poses[1], dtype)
+    ahead = frames[12:].reshape(12, -1, size)
+    spheres = _spheres(meetings, which, ahead)
     pairs = [jnp.asarray(x, jnp.int32).reshape(-1) for x in (meetings.first, meetings.second)]
     at_rest = jnp.asarray(meetings.rest, dtype).reshape(-1)
 
@@ -491,12 +494,18 @@ def _find_at_once(
     return ContactTable(jnp.where(kept > 0, _KEPT, need), rest, gap.min(0))
 
 
-def _spheres(meetings: Meetings, which: jax.Array, ahead: BodyFrames, dtype: Any) -> jax.Array:
-    """`[4, nshell few]` middles of some robots' bounding spheres, root's frame, and radii [m]."""
+def _spheres(meetings: Meetings, which: jax.Array, ahead: jax.Array) -> jax.Array:
+    """`[4, nshell few]` middles of some robots' bounding spheres, root's frame, and radii [m].
+
+    `ahead`: `[12, nbody, few]` the numbers of `BodyFrames`.
+    """
     body, lanes = meetings.body, meetings.lanes
     shapes = meetings.shapes.reshape(-1, len(body), lanes)
     own = shapes if lanes == 1 else take_lanes(shapes, which)
-    frames = jnp.stack([jnp.asarray(x, dtype)[body] for x in jax.tree.leaves(ahead)])
+    # Boxes stand in runs of the bodies that follow each other: slices are copied by vectors.
+    starts = [0, *(1 + np.flatnonzero(np.diff(body) != 1)), len(body)]
+    runs = [ahead[:, body[i] : body[i] + j - i] for i, j in pairwise(starts)]
+    frames = jnp.concatenate(runs, 1)
     middle = frames[9:] + matvec(frames[:9].reshape(3, 3, len(body), -1), own[:3])
     radius = jnp.broadcast_to(own[-1:], middle[:1].shape)
     return materialize(jnp.concatenate([middle, radius]).reshape(4, -1))
@@ -644,17 +653,22 @@ class _Contacts(NamedTuple):
         `change` are the accelerations by which hinges end where the table's contacts are.
         """
         numbers = table.rest[:_MOST]
-        number = jnp.arange(len(ahead.position[0]), dtype=numbers.dtype)[:, None]
-        ends = lambda x: weight(number == x[1], x) - weight(number == x[0], x)  # noqa: E731
-        signs = robots.carried([ends(numbers[k]) for k in range(_MOST)])
-        axis = tuple(row[2][1:] for row in ahead.rotation)
-        found = []
-        for k in range(_MOST):
-            normal, point = numbers[k, 2:5], numbers[k, 5:8]
-            arm = tuple(x - p[1:] for x, p in zip(point, ahead.position, strict=True))
-            found.append(signs[k] * dot(axis, cross(arm, tuple(normal))))
+
+        def find_levers(numbers: jax.Array, ahead: BodyFrames) -> jax.Array:
+            number = jnp.arange(len(ahead.position[0]), dtype=numbers.dtype)[:, None]
+            ends = lambda x: weight(number == x[1], x) - weight(number == x[0], x)  # noqa: E731
+            signs = robots.carried([ends(numbers[k]) for k in range(_MOST)])
+            axis = tuple(row[2][1:] for row in ahead.rotation)
+            found = []
+            for k in range(_MOST):
+                normal, point = numbers[k, 2:5], numbers[k, 5:8]
+                arm = tuple(x - p[1:] for x, p in zip(point, ahead.position, strict=True))
+                found.append(signs[k] * dot(axis, cross(arm, tuple(normal))))
+            return jnp.stack(found, 1)
+
         kept = weight(self.force > 0, self.force)
-        levers = materialize(kept * self.levers + (1 - kept) * jnp.stack(found, 1))
+        new = fuse(find_levers, inline=True)(numbers, ahead)
+        levers = materialize(kept * self.levers + (1 - kept) * new)
         every = [levers[k] for k in range(len(levers))]
         along = lambda hinges: _sum([hinges[k] * x for k, x in enumerate(every)])  # noqa: E731
         # Contact does no work: boxes part no faster than they met.
