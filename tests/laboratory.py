@@ -27,7 +27,7 @@ from experiments.water_tank import (
     quick_options,
     world,
 )
-from mjx_revolve.body.morphology import Morphology, load_morphology
+from mjx_revolve.body.morphology import Morphology, load_morphology, make_morphology
 from mjx_revolve.control.controller import Controller
 from mjx_revolve.control.readings import EpisodeContext, SensorReadings, init_memory, read_sensors
 from mjx_revolve.engine.batch import Capacity, pack_bodies
@@ -260,6 +260,23 @@ def read(text: str) -> Morphology:
     """A morphology from the text of its YAML."""
     with tempfile.TemporaryDirectory() as folder:
         return load_morphology(write(Path(folder), text))
+
+
+def fork(length: int, base: int) -> Morphology:
+    """Two parallel arms that look ahead, each with a hinge and so many bricks behind it."""
+
+    def side(slot: int) -> dict[str, Any]:
+        tip: dict[str, Any] = {"type": "FixedBrick", "orientation": -90}
+        arm = {"type": "ActiveHinge", "orientation": 90, "children": {1: tip}}
+        for _ in range(length - 1):
+            tip["children"] = {1: {"type": "FixedBrick"}}
+            tip = tip["children"][1]
+        top = {"type": "FixedBrick", "children": {slot: arm}}
+        for _ in range(base):
+            top = {"type": "FixedBrick", "children": {1: top}}
+        return top
+
+    return make_morphology({"type": "Core", "children": {2: side(3), 3: side(2)}}, name="fork")
 
 
 def swimmer(folder: Path, robot: str, task: dict[str, Any]) -> dict[str, Any]:

@@ -56,7 +56,7 @@ def advance_taped(
     def step(carry: PyTree, row: StepInputs, offset: jax.Array) -> PyTree:
         return rollout.step(carry[0], (row, NO_INTERACTION), offset)
 
-    ahead, back = fused_back(step, carry, first, still)
+    ahead, back = fused_back(step, carry, first, still, rollout.engine.tree.meets)
 
     def renew(block: PyTree, scalars: PyTree) -> PyTree:
         """Packed, without the work so far: that of a record is its own."""

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from mjx_revolve.numerics.xla import in_fused_calls, in_one_array, is_wide
+from mjx_revolve.numerics.xla import fuse, in_fused_calls, in_one_array, is_wide
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -37,7 +37,11 @@ def differentiate_as(fun: Callable[P, R], differentiated: Callable[P, R]) -> Cal
 
 
 def fused_back(
-    step: Callable[[PyTree, PyTree, PyTree], PyTree], carry: PyTree, row: PyTree, offset: jax.Array
+    step: Callable[[PyTree, PyTree, PyTree], PyTree],
+    carry: PyTree,
+    row: PyTree,
+    offset: jax.Array,
+    loops: bool = False,
 ) -> tuple[
     Callable[[PyTree, PyTree], PyTree], Callable[[PyTree, PyTree, PyTree], tuple[PyTree, jax.Array]]
 ]:
@@ -49,6 +53,8 @@ def fused_back(
         carry: an example of the carry.
         row: an example of the loop's input in one step; it has no gradient.
         offset: an example; added to a value within the step, for the gradient by that value.
+        loops: whether the step has loops over lanes. Their derivatives have scatters and unused
+            parameters, which XLA:CPU takes in no call, so that the backward step has none then.
 
     Returns:
         (forward, backward). Forward: (carry, row) → carry, without an offset. Backward: (gradient
@@ -80,10 +86,14 @@ def fused_back(
         pack,
         lambda packed, row: (unpack(packed), row),
     )
-    stacked = in_fused_calls(
-        back,
-        (carry, carry, row),
-        lambda found: (pack(found[0])[0], found[1]),
-        lambda gradient, packed, row: (unpack((gradient, packed[1])), unpack(packed), row),
-    )
-    return ahead, stacked
+
+    def result(found: tuple[PyTree, jax.Array]) -> tuple[PyTree, jax.Array]:
+        return pack(found[0])[0], found[1]
+
+    def given(gradient: PyTree, packed: PyTree, row: PyTree) -> tuple[PyTree, PyTree, PyTree]:
+        return unpack((gradient, packed[1])), unpack(packed), row
+
+    if loops:
+        whole = lambda *packed: result(back(*given(*packed)))  # noqa: E731
+        return ahead, fuse(whole, inline=True, calls=False)
+    return ahead, in_fused_calls(back, (carry, carry, row), result, given)

@@ -13,7 +13,7 @@ import pytest
 from experiments.random_bodies import random_body
 from experiments.self_contact import make_march, random_gaits
 from experiments.water_tank import EMPTY, march
-from laboratory import QUICK, at_rest, batch_engine, body, limp, need_mjx
+from laboratory import QUICK, at_rest, batch_engine, body, fork, limp, need_mjx
 from mjx_revolve import load_world
 from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
@@ -34,23 +34,6 @@ pytestmark = pytest.mark.slow
 
 def water(**fields):
     return load_world("lake", **{"bed": None, "self_contact": True, **fields})
-
-
-def fork(length, base):
-    """Two parallel arms that look ahead, each with a hinge and so many bricks behind it."""
-
-    def side(slot):
-        tip = {"type": "FixedBrick", "orientation": -90}
-        arm = {"type": "ActiveHinge", "orientation": 90, "children": {1: tip}}
-        for _ in range(length - 1):
-            tip["children"] = {1: {"type": "FixedBrick"}}
-            tip = tip["children"][1]
-        top = {"type": "FixedBrick", "children": {slot: arm}}
-        for _ in range(base):
-            top = {"type": "FixedBrick", "children": {1: top}}
-        return top
-
-    return make_morphology({"type": "Core", "children": {2: side(3), 3: side(2)}}, name="fork")
 
 
 def open_jaw(robot, lanes=1):

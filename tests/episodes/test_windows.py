@@ -1,5 +1,6 @@
 """Slopes by genes through sensors, networks, servos and water, whole episodes and windows."""
 
+import json
 from functools import cache
 
 import jax
@@ -7,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from laboratory import OAR, need_mjx, swimmer
+from laboratory import OAR, fork, need_mjx, swimmer
 from mjx_revolve import InputError, make_fitness
 from mjx_revolve.episodes.scoring import WORST
 from mjx_revolve.episodes.windows import make_windows
@@ -121,6 +122,28 @@ def test_windows_carried_on_are_one_long_rollout(brain, windows):
         new = genes[::-1]
         gradient = np.asarray(windows.step(new, before)[0].gradient).mean(1)[0]
         check_gradient(mean_gain(windows, before, new[1]), np.asarray(new[0]), gradient, 3)
+
+
+@pytest.mark.long
+def test_gradients_go_through_modules_that_touch(tmp_path):
+    """XLA aborted over the derivative of the loops over robots and their contacts."""
+    jaw = swimmer(tmp_path, json.dumps(fork(3, 1).to_mapping()), TASK | {"trials": 1})
+    windows = make_windows(make_fitness(jaw))
+    with jax.enable_x64(True):
+        draw = np.random.default_rng(7)
+        inwards = np.array([0.0, 0.0, 0.5, -0.5, 1.2, -1.2, -1.0])  # u, v, offsets, frequency
+        genes = jnp.asarray(inwards + 0.05 * draw.normal(size=(8, len(inwards))))
+        step = lambda x: windows.step(x, windows.init(x, KEY))[0]  # noqa: E731
+        score = lambda x: np.asarray(step(x).gain)[:, 0]  # noqa: E731
+        gradient = np.asarray(step(genes).gradient)[:, 0]
+        free = make_fitness(jaw, **{"world.self_contact": False})(genes, KEY)
+        touched = np.abs(np.asarray(free) - score(genes)) > 1e-9
+        assert touched.sum() > 3
+        way = draw.normal(size=genes.shape[1])
+        change = (score(genes + 1e-6 * way) - score(genes - 1e-6 * way)) / 2e-6
+        error = np.abs(change - gradient @ way) / np.abs(gradient).max(1)
+        # A touch that begins or ends within the difference bends it.
+        assert np.median(error[touched]) < 1e-5
 
 
 @pytest.mark.slow
