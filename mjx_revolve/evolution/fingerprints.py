@@ -156,6 +156,7 @@ def identify(fitness: object) -> dict[str, Any]:
         "mjx_revolve": runtime.source_hash(),
         **{name: installed_version(name) for name in _PACKAGES},
         "precision": str(jax.numpy.zeros(()).dtype),
+        "variables": runtime.unusual_modes(),
         "device": jax.default_backend(),
         "robot and world": model_hash(fitness),
     }

@@ -48,7 +48,7 @@ from mjx_revolve.inputs.user_code import announce
 from mjx_revolve.numerics import runtime
 
 # Entries of `describe_host` on which the bits of a run depend, besides its configuration.
-_HOST = ("versions", "cpu", "cpu_count", "device", "threads", "xla_flags")
+_HOST = ("versions", "cpu", "cpu_count", "device", "threads", "xla_flags", "variables")
 _RUNS = Path("runs")
 _log = logging.getLogger(__name__)
 

@@ -34,6 +34,13 @@ _THREAD_SETTINGS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 # Robots that touch themselves are computed by fours: with loops kept, 256 random bodies step a
 # fifth faster, and programs compile in a tenth less time. Some programs have other last bits.
 _LLVM = "--xla_backend_extra_options=-unroll-full-max-count=1"
+# Settings of JAX that change bits, by the variables that set them, and what they usually are.
+_MODES = {
+    "JAX_ENABLE_X64": False,
+    "JAX_DEFAULT_MATMUL_PRECISION": None,
+    "JAX_DEFAULT_PRNG_IMPL": "threefry2x32",
+    "JAX_THREEFRY_PARTITIONABLE": True,
+}
 _PACKAGES = (
     "mjx_revolve", "jax", "jaxlib", "mujoco", "mujoco-mjx", "evosax", "numpy", "scipy",
 )  # fmt: skip
@@ -373,7 +380,27 @@ def describe_process() -> dict[str, object]:
         "device": jax.devices()[0].device_kind,
         "threads": {name: os.environ.get(name) for name in (*_THREAD_SETTINGS, "NPROC")},
         "xla_flags": os.environ.get("XLA_FLAGS"),
+        "variables": unusual_modes(),
     }
+
+
+def unusual_modes() -> dict[str, str] | None:
+    """Variables that bits depend on, and their values, where these are not the usual ones.
+
+    None where all are, as in `run.json` of versions that did not look. Imports JAX: a program may
+    have changed its settings without the variables.
+    """
+    import jax
+
+    found = {name: getattr(jax.config, name.lower()) for name in _MODES}
+    modes = {
+        name: str(int(value)) if isinstance(value, bool) else str(value)
+        for name, value in found.items()
+        if value != _MODES[name]
+    }
+    if os.environ.get("MJX_REVOLVE_FUSE") == "0":  # `xla.fuses`: the same but for rounding
+        modes["MJX_REVOLVE_FUSE"] = "0"
+    return modes or None
 
 
 def usable_cores() -> int:

@@ -309,6 +309,10 @@ def test_the_command_gives_the_same_settings(copy):
     runs.RunFolder(copy).update_info(xla_flags="--a --b", threads={"OPENBLAS_NUM_THREADS": "2"})
     command = report_repeat.repeat_command(read_run(copy))
     assert command.startswith("OPENBLAS_NUM_THREADS=2 XLA_FLAGS='--a --b' python -m ")
+    runs.RunFolder(copy).update_info(xla_flags=None, threads={}, variables={"JAX_ENABLE_X64": "1"})
+    record = read_run(copy)
+    assert report_repeat.repeat_command(record).startswith("JAX_ENABLE_X64=1 python -m ")
+    assert ("variables", "JAX_ENABLE_X64 1") in report_repeat.environment(record)
 
 
 class Page(HTMLParser):

@@ -27,6 +27,8 @@ def repeat_command(record: RunRecord) -> str:
               if isinstance(value, str) and value != "1"]  # fmt: skip
     if isinstance(flags, str) and (given := runtime.user_flags(flags)):
         before.append(f"XLA_FLAGS={shlex.quote(given)}")
+    if isinstance(variables := record.info.get("variables"), dict):
+        before += [f"{name}={shlex.quote(str(value))}" for name, value in variables.items()]
     place = record.path
     words = ["python", "-m", "mjx_revolve.evolve", f"{place}/config.yaml"]
     return " ".join([*before, shlex.join([*words, "--out", f"{place}-again"])])
@@ -46,6 +48,8 @@ def environment(record: RunRecord) -> list[tuple[str, str]]:
     if isinstance(threads, dict):
         known = ", ".join(f"{name} {value}" for name, value in threads.items() if value)
         rows.append(("threads", known))
+    if isinstance(variables := info.get("variables"), dict):
+        rows.append(("variables", ", ".join(f"{name} {x}" for name, x in variables.items())))
     times = [f"{name} {info[name]}" for name in ("started", "finished") if info.get(name)]
     if times:
         rows.append(("time", ", ".join(times)))
