@@ -394,8 +394,9 @@ class EvolutionConfig(Settings):
     generations: Annotated[Integer, Ge(1)] = 60
     seed: Annotated[Integer, Ge(0), Lt(2**32)] = 0
     std_init: Annotated[Positive, Unit("-")] = 0.5
-    """Standard deviation of the first population's genes [-]; evosax's xNES takes its square, both
-    iAMaLGaM add to a variance of 1, and GuidedES, ASEBO and GradientlessDescent take a part."""
+    """Standard deviation of the first population's genes [-]; evosax's xNES takes its square,
+    iAMaLGaM_Full adds that to a variance of 1, iAMaLGaM_Univariate adds 1 to it, and GuidedES,
+    ASEBO and GradientlessDescent take a part."""
     checkpoint_every: Annotated[Integer, Ge(1)] = 5
     """Generations between checkpoints."""
     keep_checkpoints: Annotated[Integer, Ge(1)] = 3

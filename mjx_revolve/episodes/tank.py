@@ -26,7 +26,7 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.spheres import Spheres, count_spheres, pack_spheres
 from mjx_revolve.episodes.fitness import MixedFitness
 from mjx_revolve.episodes.rollout import Rollout, RolloutState, controlled, start_at_rest
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.numerics.xla import jit
 from mjx_revolve.water.flow import Water
 from mjx_revolve.water.world import World
@@ -196,18 +196,21 @@ class Tank:
             wide = np.zeros(self.mixed.num_genes, np.float32)
         else:
             wide = self.mixed.pad_genes(np.asarray(genes, np.float32), robot)
-        size = np.linalg.norm(np.asarray(quat, float))
-        three = np.shape(position) == (3,) and np.all(np.isfinite(position))
-        if not (three and np.shape(quat) == (4,) and np.isfinite(size) and size > 0):
+        where, turn = _numbers(position), _numbers(quat)
+        size = np.linalg.norm(turn)
+        three = where.shape == (3,) and np.all(np.isfinite(where))
+        if not (three and turn.shape == (4,) and np.isfinite(size) and size > 0):
             finite = "a finite place and a quaternion of some length"
-            raise InputError("tank", finite, f"{list(position)} and {list(quat)}")
+            raise InputError("tank", finite, f"{show(position)} and {show(quat)}")
         place = free[0]
-        seed = np.uint32(place if noise is None else noise)
+        seed = place if noise is None else noise
+        if not (isinstance(seed, int | np.integer) and 0 <= seed < 2**32):
+            raise InputError("noise", "a whole number >= 0 and < 2**32", show(noise))
         self._put(place, robot)
         self.robots[place] = robot
         slots = self._slots
         slots["genes"][:, place] = wide
-        slots["start"][:, place] = (*position, *np.asarray(quat, float) / size)
+        slots["start"][:, place] = (*where, *turn / size)
         slots["since"][place] = self.steps
         slots["new"][place] = True
         slots["noise"][place] = seed
@@ -254,7 +257,14 @@ class Tank:
         self._current = found
 
     def set_targets(self, target: np.ndarray | None) -> None:
-        """Sets the target of each robot's sensors, `[3, places]` world frame [m]; None: none."""
+        """Sets the target of each robot's sensors, `[3, places]` world frame [m]; None: none.
+
+        Raises:
+            InputError: it has another shape.
+        """
+        if target is not None and np.shape(target) != (3, self.places):
+            found = [*np.shape(target)]
+            raise InputError("target", f"[3, {self.places}], a place for each robot", found)
         self.target = None if target is None else np.array(target, np.float32)
 
     def _put(self, place: int, robot: Robot) -> None:
@@ -413,6 +423,14 @@ class Tank:
                 if have is None or have.shape != want.shape or have.dtype != want.dtype:
                     raise InputError("tank", "the arrays of one like this", "others")
             self.state = jax.tree.unflatten(tree, found)
+
+
+def _numbers(values: ArrayLike) -> np.ndarray:
+    """Numbers as an array; an empty one of what is none."""
+    try:
+        return np.asarray(values, float)
+    except (TypeError, ValueError):
+        return np.zeros(0)
 
 
 def make_tank(

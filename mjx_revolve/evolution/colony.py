@@ -196,8 +196,14 @@ def make_rules(fitness: BodyFitness) -> Rules:
     window = 1 + max(1, round(colony.life.window / look))
     slots = fitness.config.evolution.population_size
     rules = Rules(colony, fitness, look, looks, window, slots, np.array(world.current, float))
-    if not math.isclose(rules.interval, colony.interval, rel_tol=1e-6):
-        note(f"colony.interval: {rules.interval:g} s, as colony.look is whole steps of {step:g} s")
+    steps, looked = f"colony.look is whole steps of {step:g} s", f"it is whole looks of {look:g} s"
+    for name, wanted, found, why in (
+        ("look", colony.look, look, f"it is whole steps of {step:g} s"),
+        ("interval", colony.interval, rules.interval, steps),
+        ("life.window", colony.life.window, (window - 1) * look, looked),
+    ):
+        if not math.isclose(found, wanted, rel_tol=1e-6):
+            note(f"colony.{name}: {found:g} s, as {why}")
     if world.bed is not None:
         bed = highest_bed(world.bed, colony.arena.size / 2)
         if rules.birth_height <= bed:

@@ -274,6 +274,8 @@ def _make_strategy(
     if name == "LM_MA_ES" and size > 2 * num_genes:  # beyond, its first c_c > 2: a negative root
         most = f"at most twice the {num_genes} genes for {name}"
         raise InputError("evolution.population_size", most, size)
+    if name == "ESMC" and size % 2:  # evosax takes it, and asks for one individual less
+        raise InputError("evolution.population_size", f"an even number for {name}", size)
     try:
         algorithm = _strategies()[name](
             population_size=size, solution=jnp.zeros(num_genes), **keywords

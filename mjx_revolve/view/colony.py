@@ -26,7 +26,9 @@ def record_colony(
 ) -> Recording:
     """Replays a run's colony from a checkpoint, and records it.
 
-    Up to the run's end the recording equals the run; from there on the colony is continued.
+    Up to the run's end the recording equals the run, in a process that has called
+    `prepare_process`, as commands do: other options of the compiler give other last bits, which
+    grow. From there on the colony is continued.
 
     Args:
         folder: the run folder, or its `champion` folder; it stays as it is.

@@ -304,6 +304,22 @@ def test_what_cannot_be_a_colony_is_refused():
         make_rules(make_body_fitness(shallow))
 
 
+def test_times_that_are_rounded_are_noted(config, fitness, caplog):
+    step = fitness.mixed.world.timestep
+    times = {"look": 1.4 * step, "interval": 14 * step, "life": {"window": 60 * step}}
+    odd = make_config(COLONY | {"colony": COLONY["colony"] | times}, ROOT)
+    rules = make_rules(replace(fitness, config=odd))
+    assert rules.look == pytest.approx(step) and rules.interval == pytest.approx(14 * step)
+    assert caplog.messages == [f"colony.look: {step:g} s, as it is whole steps of {step:g} s"]
+    caplog.clear()
+    times = {"look": step, "interval": 10 * step, "life": {"window": 20.4 * step}}
+    odd = make_config(COLONY | {"colony": COLONY["colony"] | times}, ROOT)
+    rules = make_rules(replace(fitness, config=odd))
+    assert rules.window == 21
+    said = f"colony.life.window: {20 * step:g} s, as it is whole looks of {step:g} s"
+    assert caplog.messages == [said]
+
+
 @pytest.mark.slow
 def test_the_shipped_configuration():
     """What docs/colony.md says of it."""

@@ -255,6 +255,7 @@ def test_commands_are_done(served):
     assert command(served, {"do": "current", "velocity": [0.1, 0, 0]}, Origin=other)[0] == 200
     assert served.simulation.current == (0.1, 0, 0)
     assert command(served, {"do": "reset"})[0] == 200
+    assert [one.name for one in served.simulation.robots] == ["spider"]  # as at the beginning
 
 
 def test_the_stream(served):

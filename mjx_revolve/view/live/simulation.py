@@ -288,6 +288,7 @@ class LiveSimulation:
             case Reset():
                 for one in self.robots:
                     self._remove(one)
+                self._names.clear()
                 self._set_current(self.world.current)
                 self.paused, self.rate = False, 1.0
                 for drop in self._first:
