@@ -39,7 +39,11 @@ def water_at(
     # A row of the trajectory is the state after its step, which the next step's water meets.
     after = np.clip(rows + 1, 0, steps - 1)
     pick = lambda x: np.broadcast_to(np.asarray(x, np.float32), (steps,))[after]  # noqa: E731
-    now: Water = jax.tree.map(pick, water_of(world) if water is None else water)
+    given = water_of(world) if water is None else water
+    if np.shape(given.time) == (steps,):  # of each step, as `simulate` has it, not of the start
+        start = np.asarray(given.time, float) - world.timestep * np.arange(steps)
+        given = given._replace(time=start)
+    now: Water = jax.tree.map(pick, given)
     return now._replace(time=(now.time + time).astype(np.float32))
 
 

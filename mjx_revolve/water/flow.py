@@ -302,8 +302,9 @@ def _fading(world: World, wave: Wave, water: Water, z: Scalar) -> tuple[Scalar, 
 def wave_convection(world: World, water: Water, x: Scalar, y: Scalar, z: Scalar) -> Vec:
     """u·∇ of the waves' orbital velocity: what water accelerates by because it moves on.
 
-    u is all that moves the water but the world's current, which carries the waves: `wave_flow`
-    has what follows from that.
+    u is all that moves the water but the level part of the world's current, which carries the
+    waves: `wave_flow` has what follows from that. Waves fade with depth, so rising water meets
+    others.
 
     Above the still surface it is the value at the still surface.
     Of second order in the waves' steepness, like the drift that it keeps away: without it a neutral
@@ -319,7 +320,7 @@ def wave_convection(world: World, water: Water, x: Scalar, y: Scalar, z: Scalar)
     Returns:
         Acceleration [m/s²], world frame.
     """
-    rest = water._replace(current=vsub(water.current, world.current))
+    rest = water._replace(current=vsub(water.current, (*world.current[:2], 0.0)))
     velocity, _ = flow(world, rest, x, y, z)
     gradient: list[Scalar] = [0.0] * 6  # ∇u is symmetric, as u has a potential: xx xy xz yy yz zz
     for wave in _running(world):

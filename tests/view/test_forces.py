@@ -111,6 +111,10 @@ def test_water_of_its_time():
         u = [float(x) for x in flow(sea, still._replace(time=time[k]), 0.3, 0.0, -0.5)[0]]
         c = face_drag(robot).linear[0]
         assert forces.drag[k, 0] == pytest.approx(c * np.abs(u) * u, rel=2e-3, abs=1e-6)
+    # A time for each step, which `simulate` takes as well, says the same as that of the start.
+    moments = still._replace(time=sea.timestep * np.arange(3))
+    each = module_forces(robot, states(robot, rows, time=time), water=moments)
+    assert each.drag == pytest.approx(forces.drag, rel=1e-5)
     # A row of the current is the water of the step that follows; the last one stays.
     robot = box_robot(BRICK, 0.03, world(drag="faces"))
     gusty = Water(0.0, (np.array([0.1, 0.2, 0.3]), 0.0, 0.0))

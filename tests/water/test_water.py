@@ -15,6 +15,7 @@ from mjx_revolve.water.flow import (
     needs_horizontal_position,
     surface,
     water_of,
+    wave_convection,
 )
 from mjx_revolve.water.world import make_world
 
@@ -182,6 +183,21 @@ def test_waves_are_carried_by_the_worlds_current():
     velocity, acceleration = moving(world, carried, time)
     assert np.allclose(velocity - drift, moving(still, place, time)[0], rtol=0, atol=1e-13)
     assert np.allclose(acceleration, moving(still, place, time)[1], rtol=0, atol=1e-12)
+
+
+def test_water_accelerates_along_its_own_path():
+    """∂u/∂t + u·∇u of the waves, with what a gust adds, and in a current that rises."""
+    world = make_world(waves=SEA, water_depth=3.0, current=(0.3, -0.2, 0.1))
+    own = 0.35, -0.1, 0.08
+    place, time, d = places(deepest=-1.0) - [[0], [0], [0.01]], 3.1, 1e-5
+    before, after = (moving(world, place, t, current=own)[0] for t in (time - d, time + d))
+    velocity, push = moving(world, place, time, current=own)
+    gradient = differences(lambda p: moving(world, p, time, current=own)[0], place)
+    whole = (after - before) / (2 * d) + np.einsum("ijn,in->jn", gradient, velocity)
+    with jax.enable_x64(True):
+        water = water_of(world)._replace(time=time, current=own)
+        convected = np.stack(wave_convection(world, water, *map(jnp.asarray, place)))
+    assert np.allclose(push + convected, whole, rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize(("shear", "depth", "share"), [
