@@ -225,6 +225,12 @@ class BodiesConfig(Settings):
         if selection.novelty and not wants:
             none = "none, as novelty is no objective"
             raise ConstraintError("selection.novelty", none, ", ".join(selection.novelty))
+        usual = type(selection).model_fields
+        if selection.neighbours != usual["neighbours"].default and not wants:
+            note("bodies.selection.neighbours has no effect, as novelty is no objective")
+        drawn = selection.type in ("map_elites", "random")
+        if selection.tournament != usual["tournament"].default and drawn:
+            note(f"bodies.selection.tournament has no effect: {selection.type} holds none")
         if self.learning.strategy_params and self.learning.generations == 1:
             none = "none, as with one generation no strategy learns"
             raise ConstraintError("learning.strategy_params", none, "some")

@@ -321,7 +321,10 @@ class MixedFitness(EpisodeSpec[PackedBodies]):
         return genes[..., self._indices(robot)]
 
     def _indices(self, robot: Robot) -> np.ndarray:
-        return gene_indices(self.controller_of(robot), self.controller)
+        own = self.controller_of(robot)
+        if not set(own.genes) <= set(self.controller.genes):
+            self.pack([robot])  # says in which way the body is too large
+        return gene_indices(own, self.controller)
 
     def __call__(
         self, robots: Robot | Sequence[Robot] | PackedBodies, population: ArrayLike, key: jax.Array

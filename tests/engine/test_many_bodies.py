@@ -420,6 +420,9 @@ def test_genes_find_their_joints_again(fitness):
     assert len(set(places.tolist())) == len(places) == fitness.controller_of(robot).num_genes
     with pytest.raises(InputError, match=rf"genes: expected \[..., {len(places)}\]; found \[2, 3"):
         fitness.pad_genes(np.zeros((2, 3)), robot)
+    wide, large = np.zeros((2, fitness.num_genes)), fitness.build(random_body(1, 9))
+    for give in (fitness.pad_genes, fitness.own_genes):
+        check_refused("'random_1': expected at most 8 hinges; found 9", give, wide, large)
 
 
 def test_what_it_cannot_do_is_refused_by_name(config, fitness):

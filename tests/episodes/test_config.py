@@ -129,6 +129,15 @@ def test_typed_paths_start_from_the_current_folder(folder):
     assert config.world == str(folder / "pond.yaml")
 
 
+def test_settings_of_selection_without_effect_are_noted(caplog):
+    odd = "bodies={selection: {type: random, tournament: 3, neighbours: 4}}"
+    load_config("lake_map_elites", [odd])
+    assert caplog.messages == [
+        "bodies.selection.neighbours has no effect, as novelty is no objective",
+        "bodies.selection.tournament has no effect: random holds none",
+    ]
+
+
 def test_written_paths_start_from_the_file(folder):
     (folder / "good.yaml").write_text(GOOD.replace("lake", "{name: pond.yaml, drag: mask}"))
     config = load_config(folder / "good.yaml")

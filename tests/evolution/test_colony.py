@@ -306,18 +306,12 @@ def test_what_cannot_be_a_colony_is_refused():
 
 def test_times_that_are_rounded_are_noted(config, fitness, caplog):
     step = fitness.mixed.world.timestep
-    times = {"look": 1.4 * step, "interval": 14 * step, "life": {"window": 60 * step}}
-    odd = make_config(COLONY | {"colony": COLONY["colony"] | times}, ROOT)
-    rules = make_rules(replace(fitness, config=odd))
-    assert rules.look == pytest.approx(step) and rules.interval == pytest.approx(14 * step)
-    assert caplog.messages == [f"colony.look: {step:g} s, as it is whole steps of {step:g} s"]
-    caplog.clear()
-    times = {"look": step, "interval": 10 * step, "life": {"window": 20.4 * step}}
-    odd = make_config(COLONY | {"colony": COLONY["colony"] | times}, ROOT)
-    rules = make_rules(replace(fitness, config=odd))
-    assert rules.window == 21
-    said = f"colony.life.window: {20 * step:g} s, as it is whole looks of {step:g} s"
-    assert caplog.messages == [said]
+    for look, window in ((1.4, 60), (1, 20.4)):
+        times = {"look": look * step, "interval": 14 * step, "life": {"window": window * step}}
+        odd = make_config(COLONY | {"colony": COLONY["colony"] | times}, ROOT)
+        assert make_rules(replace(fitness, config=odd)).window == round(window) + 1
+    found = "look: 0.0125 s, as it is whole steps", "life.window: 0.25 s, as it is whole looks"
+    assert caplog.messages == [f"colony.{words} of 0.0125 s" for words in found]
 
 
 @pytest.mark.slow

@@ -116,8 +116,7 @@ def test_strategies_reach_the_optimum_or_get_nearer(name):
 ({"strategy": "CMA_SE"}, "found 'CMA_SE'; did you mean CMA_ES?"),
 ({"strategy": "OpenES", "population_size": 15},
          "evolution.population_size: expected an even number for Open_ES; found 15"),
-({"strategy": "ESMC", "population_size": 15},
-         "evolution.population_size: expected an even number for ESMC; found 15"),
+({"strategy": "ESMC", "population_size": 15}, "expected an even number for ESMC; found 15"),
 ({"strategy_params": {"std_mni": 1.0}},
          "evolution.strategy_params.std_mni: expected one of c_1, c_c, c_mean, c_mu, c_std, chi_n, "
          "d_std, mu_eff, std_max, std_min, weights for CMA_ES; found an unknown name"),
