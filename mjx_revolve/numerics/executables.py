@@ -119,10 +119,9 @@ def _keep(path: Path, made: Any) -> None:
             beside.unlink(missing_ok=True)
 
 
-def _modes() -> tuple[Any, bool]:
+def _modes() -> tuple[str, bool]:
     """What may change within a process, and a program with it."""
-    names = "jax_enable_x64", "jax_default_matmul_precision", "jax_threefry_partitionable"
-    return tuple(getattr(jax.config, name) for name in names), fuses()
+    return str(runtime.unusual_modes()), fuses()
 
 
 def _load(path: Path, tree: PyTree) -> Any:

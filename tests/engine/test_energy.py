@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from test_self_contact import fork
 
-from laboratory import ARM, OAR, read
+from laboratory import ARM, OAR, fork, read
 from mjx_revolve import build_robot, load_morphology, load_world, simulate
 from mjx_revolve.engine.energy import energy_balance
 from mjx_revolve.engine.forces import motor_torques
