@@ -251,9 +251,9 @@ class Tank:
         Raises:
             InputError: these are no three finite numbers.
         """
-        found = np.array(current, np.float32)
+        found = _numbers(current).astype(np.float32)
         if found.shape != (3,) or not np.all(np.isfinite(found)):
-            raise InputError("current", "three numbers [m/s]", list(current))
+            raise InputError("current", "three numbers [m/s]", show(current))
         self._current = found
 
     def set_targets(self, target: np.ndarray | None) -> None:

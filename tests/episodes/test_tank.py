@@ -168,7 +168,8 @@ def test_what_cannot_be_is_refused(tank, mixed, robots):
     check_refused("a world below 1; found -1", water.add, robots[0], None, (0, 0, -1), world=-1)
     for noise in (-1, 2**32, 0.5):
         check_refused("noise: expected", water.add, robots[0], None, (0, 0, -1), noise=noise)
-    check_refused("current: expected three numbers", water.set_current, (0, 1))
+    for current in ((0, 1), None, (0, 0, "x")):
+        check_refused("current: expected three numbers", water.set_current, current)
     check_refused("target: expected [3, 4], a place", water.set_targets, np.zeros((3, 2)))
     for times in ((-1, 0.1), (np.nan, 0.1), (1, 0)):
         check_refused("expected times > 0 to advance by", water.advance, *times)
