@@ -71,6 +71,7 @@ class PackedRow:
     tree: Any = field(metadata={"static": True})
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class BatchedTrees:
     """Many robots as a `Tree`; its methods are described there.
@@ -89,10 +90,10 @@ class BatchedTrees:
         variation: factors on the constants, or None.
     """
 
-    world: World
-    capacity: Capacity
+    world: World = field(metadata={"static": True})
+    capacity: Capacity = field(metadata={"static": True})
     bodies: PackedBodies
-    lanes: int
+    lanes: int = field(metadata={"static": True})
     stack_indices: StackIndices
     table: PackedConstants
     count: Any
@@ -169,15 +170,17 @@ class BatchedTrees:
         columns = saved.data.reshape(-1, saved.tree.num_leaves, self.lanes)
         return select(jax.tree.unflatten(saved.tree, list(jnp.moveaxis(columns, 1, 0))))
 
-    def at_lanes(self, which: jax.Array) -> BatchedTrees:
+    def at_lanes(self, which: jax.Array | None) -> BatchedTrees:
         """A tree with fewer lanes; its constants are not those of the robots in them."""
+        if which is None:
+            return self
         indices = self.stack_indices
         if not self.bodies.alike:
             indices = jax.tree.map(lambda x: take_lanes(x, which), indices)
         return replace(self, lanes=len(which), stack_indices=indices, variation=None)
 
     def saved_at_lanes(
-        self, saved: PackedRow, select: Callable[[Any], Any], which: jax.Array
+        self, saved: PackedRow, select: Callable[[Any], Any], which: jax.Array | None
     ) -> PackedRow:
         """Columns of selected saved values."""
         count = saved.tree.num_leaves
@@ -186,7 +189,7 @@ class BatchedTrees:
         found = [take_lanes(columns[:, k], which) for k in leaves]
         return PackedRow(jnp.concatenate(found, 1), tree)
 
-    def hinge_positions(self, which: jax.Array) -> Vec:
+    def hinge_positions(self, which: jax.Array | None) -> Vec:
         """Of each lane, or one for all."""
         hinges = self._rows.hinges
         assert hinges is not None
@@ -429,7 +432,7 @@ def make_batched_trees(
             np.zeros(capacity.root_shells, int),
             np.repeat(np.arange(1, capacity.rows + 1), capacity.shells),
         )
-        met = Meetings.of(boxes, body, bodies.first, bodies.second, bodies.rest, steady)
+        met = Meetings.of(boxes, body, bodies.first, bodies.second, bodies.rest)
     return BatchedTrees(world, capacity, bodies, lanes, stack_indices, table, count, met)
 
 

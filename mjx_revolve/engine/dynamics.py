@@ -9,6 +9,7 @@ Spatial quantities are (angular, linear), in each body's own frame, about its ow
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -219,16 +220,19 @@ class _Factors(NamedTuple):
 
 
 def _look_at(
-    tree: Tree, factors: _Factors, moving: tuple[Any, Any, jax.Array], dt: float, which: jax.Array
+    dt: float,
+    values: tuple[Tree, _Factors, tuple[Any, Any, jax.Array]],
+    which: jax.Array | None,
 ) -> Robots:
-    """The robots in the lanes `which`, as contacts look at them.
+    """The robots in the lanes `which`, None for all, as contacts look at them.
 
-    `moving`: speeds, accelerations and levers of all robots' hinges, see `_with_contact`.
+    `values`: tree and factors; all hinges' speeds, accelerations and levers, see `_with_contact`.
     """
+    tree, factors, moving = values
     few, places = tree.at_lanes(which), tree.hinge_positions(which)
     turns = tree.saved_at_lanes(factors.moved, lambda moved: moved[1], which)
     speed, hurry, lever = jax.tree.map(lambda x: take_lanes(x, which), moving)
-    like = jnp.zeros(len(which), lever.dtype)
+    like = jnp.zeros(lever.shape[-1], lever.dtype)
     hurry = few.join_rows(hurry, like)
     drift = dt**2 * total(*[lever[k] * jnp.abs(hurry[k]) for k in range(len(lever))])
 
@@ -252,10 +256,10 @@ def _look_at(
 
 
 def _make_respond(
-    tree: Tree, factors: _Factors, dt: float, which: jax.Array, turns: Any, places: Any
+    tree: Tree, factors: _Factors, dt: float, which: jax.Array | None, turns: Any, places: Any
 ) -> Respond:
     """For some of the robots, what further torques of their hinges add to all accelerations."""
-    lanes, symmetric = len(which), factors.symmetric
+    symmetric = factors.symmetric
     own = lambda x: take_lanes(x, which) if jnp.shape(x)[-1:] not in ((), (1,)) else x  # noqa: E731
     block: Block = jax.tree.map(own, factors.root)
     saved = tree.saved_at_lanes(factors.saved, lambda saved: (saved[0][:3], saved[2]), which)
@@ -291,7 +295,7 @@ def _make_respond(
         angular, linear = root = solve_root(block, (bias[:3], bias[3:]), symmetric)
         hinges = few.forward_pass(accelerate_joint, root, turns, places, saved, rests, *velocities)
         like = torque[0]
-        wide = [jnp.broadcast_to(x, (1, lanes)) for x in (*linear, *angular)]
+        wide = [jnp.broadcast_to(x, (1, *like.shape)) for x in (*linear, *angular)]
         return jnp.concatenate([*wide, few.join_rows(hinges, like)])
 
     return respond
@@ -318,7 +322,8 @@ def _with_contact(
         tree.meetings(like),
         state.clearance - total(*ways),
         state.clearance < 0,
-        lambda which: _look_at(tree, factors, (state.speed, qacc[2], levers), dt, which),
+        (tree, factors, (state.speed, qacc[2], levers)),
+        partial(_look_at, dt),
         6 + len(ways),
         dt,
         len(state.pressed),

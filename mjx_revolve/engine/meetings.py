@@ -72,7 +72,6 @@ class Meetings(NamedTuple):
         second: the other box; the same one for padding, which stands behind all pairs.
         rest: by how much the boxes of each pair overlap at rest [m].
         count: `[lanes]` or `[1]` how many pairs a robot has, int32.
-        steady: whether loops are to have a known length, so that they have derivatives.
         halves: `[nshell, 5]` the module of each, the way to its right and its middle along that
             way, body frame [m]; None of many different robots.
     """
@@ -84,8 +83,12 @@ class Meetings(NamedTuple):
     second: Any
     rest: Any
     count: Any
-    steady: bool
     halves: np.ndarray | None = None
+
+    @property
+    def steady(self) -> bool:
+        """Whether loops are to have a known length: of one body, XLA:CPU aborts over others."""
+        return self.lanes == 1
 
     @staticmethod
     def of(
@@ -94,11 +97,10 @@ class Meetings(NamedTuple):
         first: Any,
         second: Any,
         rest: Any,
-        steady: bool,
         halves: np.ndarray | None = None,
     ) -> Meetings:
         """Of pairs of shells."""
         radius = jnp.sqrt(dot(boxes.half_size, boxes.half_size))
         count = (first != second).sum(0).astype(np.int32)
         shapes = jnp.stack([x.reshape(-1) for x in (*jax.tree.leaves(boxes), radius)])
-        return Meetings(radius.shape[1], shapes, body, first, second, rest, count, steady, halves)
+        return Meetings(radius.shape[1], shapes, body, first, second, rest, count, halves)

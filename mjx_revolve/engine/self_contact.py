@@ -23,7 +23,7 @@ times as much.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import reduce
+from functools import partial, reduce
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -42,7 +42,7 @@ from mjx_revolve.numerics.boxes import (
     matvec,
     weight,
 )
-from mjx_revolve.numerics.spatial import cross
+from mjx_revolve.numerics.spatial import Vec, cross
 from mjx_revolve.numerics.xla import fuse, materialize, on_cpu, take_lanes
 
 # Contacts of one robot at a time. A choice: few robots have more.
@@ -105,15 +105,16 @@ def contact_acceleration(
     meetings: Meetings,
     clearance: jax.Array,
     touched: jax.Array,
-    look_at: Callable[[jax.Array], Robots],
+    values: Any,
+    look_at: Callable[[Any, jax.Array | None], Robots],
     rows: int,
     dt: float,
     felt: int = 0,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Accelerations of robots by contacts of their own modules.
 
-    Only robots are looked at that have used up their clearance, a few at a time. On other back ends
-    than the CPU a kernel takes as long for one robot as for all: there all are, when one has.
+    Its derivatives are those of the contacts that push, see `_differentiable_response`: which ones
+    do has none.
 
     Args:
         meetings: which boxes can meet.
@@ -121,7 +122,8 @@ def contact_acceleration(
             negative where that is not known.
         touched: `[lanes]` whether they did not stay apart before. Those that did not are looked at
             together: a few robots take as long as the one with the most contacts.
-        look_at: which lanes, int32 → the robots in them.
+        values: all of the robots that has arrays.
+        look_at: (such values, which lanes, int32, None: all) → the robots in them.
         rows: of a response.
         dt: of the step [s].
         felt: rows of the forces that sensors feel, see `State.pressed`.
@@ -129,38 +131,90 @@ def contact_acceleration(
     Returns:
         As a response; the clearance as it is known then; and the forces that are felt.
     """
+    # A function with a derivative of its own takes all arrays that it reads. Numbers stay numbers,
+    # so that what they make 0 is left out.
+    leaves, structure = jax.tree.flatten((meetings, values))
+    traced = [k for k, x in enumerate(leaves) if isinstance(x, jax.Array)]
+
+    def fill(arrays: list[jax.Array]) -> tuple[Meetings, Callable[[jax.Array | None], Robots]]:
+        given = dict(zip(traced, arrays, strict=True))
+        filled = [given.get(k, x) for k, x in enumerate(leaves)]
+        pairs, values = jax.tree.unflatten(structure, filled)
+        return pairs, partial(look_at, values)
+
+    def search(listed: bool, arrays: Any, clearance: jax.Array, touched: jax.Array) -> jax.Array:
+        pairs, robots = fill(arrays)
+        return _search(pairs, clearance, touched, robots, rows, dt, felt, listed)
+
+    solve = jax.custom_jvp(partial(search, False))
+
+    @solve.defjvp
+    def differentiate(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+        found = search(True, *jax.lax.stop_gradient(primals))
+        found, contacts = found[: rows + 1 + felt], found[rows + 1 + felt :]
+
+        def respond(arrays: Any) -> jax.Array:
+            pairs, robots = fill(arrays)
+            return _differentiable_response(pairs, robots(None), contacts, dt, felt)
+
+        _, change = jax.jvp(respond, primals[:1], tangents[:1])
+        still = jnp.zeros_like(found[:1])
+        return found, jnp.concatenate([change[:rows], still, change[rows:]])
+
+    found = solve([leaves[k] for k in traced], clearance, touched)
+    return found[:rows], found[rows], found[rows + 1 :]
+
+
+def _search(
+    meetings: Meetings,
+    clearance: jax.Array,
+    touched: jax.Array,
+    look_at: Callable[[jax.Array], Robots],
+    rows: int,
+    dt: float,
+    felt: int,
+    listed: bool,
+) -> jax.Array:
+    """Contacts' accelerations, the clearance as it is known then, and the forces that are felt.
+
+    Only robots are looked at that have used up their clearance, a few at a time. On other back ends
+    than the CPU a kernel takes as long for one robot as for all: there all are, when one has.
+    If `listed`, `[_ROUNDS (2 _MOST + 1), lanes]` follow: forces and pairs of the contacts after
+    each round, and whether it was the first one.
+    """
     lanes, dtype, steady = len(clearance), clearance.dtype, meetings.steady
     wanted = (clearance < 0) & (meetings.count > 0)
     size = min(_ROBOTS if meetings.lanes > 1 else _ALIKE, lanes)
     most = -(-lanes // size)
     # One array: XLA:CPU aborts over a loop of which a part is not used, as the clearance would be
     # where a caller returns positions only.
-    rest = jnp.zeros((rows + felt, lanes), dtype)
+    more = felt + _ROUNDS * (2 * _MOST + 1) * listed
+    rest = jnp.zeros((rows + more, lanes), dtype)
     start = jnp.concatenate([rest[:rows], clearance[None], rest[rows:]])
 
     def look() -> Any:
         room = jnp.zeros(most * size + 1, jnp.int32), jnp.int32(0)
         every = jnp.arange(lanes, dtype=jnp.int32)
         first = append_true(wanted & touched, every, room, steady)
-        listed, count = append_true(wanted & ~touched, every, first, steady)
+        order, count = append_true(wanted & ~touched, every, first, steady)
 
         def visit(k: Any, found: Any) -> Any:
-            which = jax.lax.dynamic_slice(listed, (k * size,), (size,))
+            which = jax.lax.dynamic_slice(order, (k * size,), (size,))
             real = k * size + jnp.arange(size, dtype=jnp.int32) < count
-            solved = _settle(meetings, which, real, look_at(which), rows, dt, felt)
+            solved = _settle(meetings, which, real, look_at(which), rows, dt, felt, listed)
             return _put(found, solved, which, real)
 
         return _repeat(-(-count // size), most, visit, start, steady)
 
     def look_at_all() -> Any:
         which = jnp.arange(lanes, dtype=jnp.int32)
-        solved = _settle(meetings, which, wanted, look_at(which), rows, dt, felt)
+        solved = _settle(meetings, which, wanted, look_at(which), rows, dt, felt, listed)
         return jnp.where(wanted, solved, start)
 
     found: jax.Array = jax.lax.cond(
         any_lane(wanted), fuse(look) if on_cpu() else look_at_all, lambda: start
     )
-    return found[:rows], found[rows], found[rows + 1 :]
+    return found
 
 
 def _settle(
@@ -171,8 +225,11 @@ def _settle(
     rows: int,
     dt: float,
     felt: int,
+    listed: bool,
 ) -> jax.Array:
     """Accelerations of some robots by their contacts, the clearance without them, forces felt.
+
+    If `listed`, what the rounds found, too, see `_search`.
 
     In rounds: contacts are first looked for where bodies would be at unchanged speeds, which is
     where they stay if they press; where they end up elsewhere, further ones are looked for there,
@@ -190,16 +247,17 @@ def _settle(
         zeros(_MOST, rows),
         zeros(_MOST),
         zeros(_MOST, 4 if halves else 2) if felt else None,
+        zeros(_MOST) if listed else None,
     )
 
     def look_again(now: Any) -> Any:
-        contacts, clear, moving, first = now
+        contacts, clear, moving, first, rounds = now
         change = contacts.acceleration()[6:] - first * robots.hurry
         # Within a loop only what is fused by itself is computed once.
         frames = fuse(robots.pose, inline=True)(steps + dt**2 * change)
         kept = weight(contacts.force > 0, clear)
         drift = first * robots.drift
-        table = find(meetings, which, moving > 0, frames, kept, drift, dt, halves)
+        table = find(meetings, which, moving > 0, frames, kept, drift, dt, halves, listed)
         near = (table.need > -drift / dt**2) & (table.need < _KEPT)
         touches = _largest(weight(near, kept)) > 0
 
@@ -212,18 +270,30 @@ def _settle(
             any_lane(touches), resolve, lambda: (contacts, jnp.zeros_like(moving))
         )
         clear = first * (table.clear - drift) + (1 - first) * clear
-        return found, clear, moving, jnp.zeros_like(first)
+        if listed:  # the last round stands last, and those before it begin with none
+            assert found.pairs is not None
+            own = jnp.concatenate([found.force, found.pairs, first[None]])
+            rounds = jnp.concatenate([rounds[1:], own[None]])
+        return found, clear, moving, jnp.zeros_like(first), rounds
 
-    start = none, zeros(), weight(real, steps), jnp.ones_like(steps[0])
-    contacts, clear, *_ = _while_any(2, _ROUNDS, look_again, start, meetings.steady)
+    rounds = zeros(_ROUNDS, 2 * _MOST + 1) if listed else ()
+    start = none, zeros(), weight(real, steps), jnp.ones_like(steps[0]), rounds
+    contacts, clear, *_, rounds = _while_any(2, _ROUNDS, look_again, start, meetings.steady)
     found = [contacts.acceleration(), clear[None]]
     if contacts.ends is not None:
-        row = jnp.arange(felt, dtype=steps.dtype)[:, None]
         # Halves of modules stand behind the bodies.
         ends = [contacts.ends[:, k] + bodies * (k > 1) for k in range(contacts.ends.shape[1])]
-        at = lambda k: _sum([weight(row == x[k], steps) for x in ends])  # noqa: E731
-        found.append(_sum([contacts.force[k] * at(k) for k in range(_MOST)]))
+        found.append(_felt(contacts.force, ends, felt))
+    if listed:
+        found.append(rounds.reshape(-1, size))
     return jnp.concatenate(found)
+
+
+def _felt(force: jax.Array, ends: list[jax.Array], felt: int) -> jax.Array:
+    """`[felt, lanes]` forces of contacts, at what is pressed: rows of `[_MOST, lanes]` each."""
+    row = jnp.arange(felt, dtype=force.dtype)[:, None]
+    at = lambda k: _sum([weight(row == x[k], force) for x in ends])  # noqa: E731
+    return _sum([force[k] * at(k) for k in range(_MOST)])
 
 
 def _put(into: jax.Array, columns: jax.Array, which: jax.Array, real: jax.Array) -> jax.Array:
@@ -244,7 +314,7 @@ def _loop(count: Any, body: Callable[[jax.Array, Any], Any], carry: Any) -> Any:
 
 
 def _repeat(count: Any, most: int, body: Any, carry: Any, steady: bool) -> Any:
-    """A loop of `count` rounds; of known length, so that it has derivatives, where it must be."""
+    """A loop of `count` rounds; of known length where it must be, see `Meetings.steady`."""
     if not steady:
         return _loop(count, body, carry)
 
@@ -272,7 +342,7 @@ def _while_any(
 def append_true(flags: jax.Array, values: jax.Array, found: Any, steady: bool) -> Any:
     """A list with room for one more, and its length, with the values `[n]` where flags are set.
 
-    `steady` loops have a known length, so that they have derivatives.
+    `steady` loops have a known length, see `Meetings.steady`.
     """
     if not on_cpu():  # where a loop over flags would be a kernel for each
         listed, count = found
@@ -336,11 +406,13 @@ def _find_contacts(
     drift: jax.Array,
     dt: float,
     halves: bool,
+    listed: bool,
 ) -> ContactTable:
     """Contacts of some robots: pairs with bounding spheres that may overlap when the step ends.
 
     None take the places `[_MOST, lanes]` that are 1 in `kept`; boxes are where they end but for a
-    `drift` of `[lanes]` [m]. `halves`: which halves of modules are in contact is found, too.
+    `drift` of `[lanes]` [m]. `halves`: which halves of modules are in contact is found, too, and if
+    `listed`, which pairs.
     """
     size, dtype, steady = len(which), kept.dtype, meetings.steady
     npair, lanes = meetings.first.shape
@@ -373,7 +445,7 @@ def _find_contacts(
 
     def gather(carry: Any) -> Any:
         """The next spheres."""
-        block, listed, clear = carry
+        block, near_pairs, clear = carry
         number = block * width + jnp.arange(width, dtype=jnp.int32)
         one, other = look_up(jnp.minimum(number, npair * size - 1))
         start, end = (pick(spheres, box.shell * size + box.lane) for box in (one, other))
@@ -381,15 +453,14 @@ def _find_contacts(
         given = take_lanes(real, one.lane) & (one.shell != other.shell) & (number < npair * size)
         square = dot(away, away)
         near = given & (square < (reach + take_lanes(drift, one.lane)) ** 2)
-        # Of a pair that stands for none the root has a gradient, too, and it must be finite.
         apart = jnp.where(given & ~near, jnp.sqrt(jnp.maximum(square, 1e-30)) - reach, _FAR)
         for k in range(0, width, size):
             clear = jnp.minimum(clear, apart[k : k + size])
-        return block + 1, append_true(near, number, listed, steady), clear
+        return block + 1, append_true(near, number, near_pairs, steady), clear
 
-    def examine(listed: Any, table: ContactTable) -> ContactTable:
-        """The contacts of listed pairs join those of each robot; the weakest give way."""
-        numbers, count = listed
+    def examine(near_pairs: Any, table: ContactTable) -> ContactTable:
+        """The contacts of these pairs join those of each robot; the weakest give way."""
+        numbers, count = near_pairs
 
         def measure(k: Any, table: ContactTable) -> ContactTable:
             number = jax.lax.dynamic_slice(numbers, (k * _PAIRS,), (_PAIRS,))
@@ -404,44 +475,45 @@ def _find_contacts(
                 tables = [pick(cells, x.shell) for x in given]
                 ahead = [frame[12:] for frame, _ in shown]
                 found += [_half(*x, units[3:]) for x in zip(tables, ahead, strict=True)]
-            numbers_of = jnp.stack(found)
+            if listed:
+                found.append((number // size).astype(dtype))
             left = count - k * _PAIRS
             if steady:
-                listed = jnp.arange(_PAIRS, dtype=jnp.int32) < left
-                need, gap = jnp.where(listed, need, _NONE), jnp.where(listed, gap, _FAR)
+                real = jnp.arange(_PAIRS, dtype=jnp.int32) < left
+                need, gap = jnp.where(real, need, _NONE), jnp.where(real, gap, _FAR)
             left = _PAIRS if steady else jnp.minimum(left, _PAIRS)
-            return _insert(table, left, (need, gap, numbers_of), given[0].lane)
+            return _insert(table, left, (need, gap, jnp.stack(found)), given[0].lane)
 
         return _repeat(-(-count // _PAIRS), -(-npair * size // _PAIRS), measure, table, steady)
 
     clear = jnp.full(size, _FAR, dtype)
     table = ContactTable(
         _NONE + (_KEPT - _NONE) * kept,
-        jnp.zeros((_MOST + 1, 10 if halves else 8, size), dtype),
+        jnp.zeros((_MOST + 1, 8 + 2 * halves + listed, size), dtype),
         clear,
     )
     room = most * width if steady else min(most * width, _ROOM)
     start = jnp.zeros(room + max(width, _PAIRS), jnp.int32), jnp.int32(0)
     if steady:
-        _, listed, clear = _loop(most, lambda _, x: gather(x), (jnp.int32(0), start, clear))
-        table = examine(listed, table)
-    else:
-        count = jnp.int32(0)
-        for k in range(size):
-            own = meetings.count[0] if lanes == 1 else meetings.count[which[k]]
-            count = jnp.maximum(count, jnp.where(real[k], own, 0))
-        blocks = -(-count * size // width)
+        _, near_pairs, clear = _loop(most, lambda _, x: gather(x), (jnp.int32(0), start, clear))
+        table = examine(near_pairs, table)
+        return table._replace(clear=jnp.minimum(clear, table.clear))
+    count = jnp.int32(0)
+    for k in range(size):
+        own = meetings.count[0] if lanes == 1 else meetings.count[which[k]]
+        count = jnp.maximum(count, jnp.where(real[k], own, 0))
+    blocks = -(-count * size // width)
 
-        def more(carry: Any) -> Any:
-            """The next blocks, until the list is full."""
-            block, clear, table = carry
-            wanted = lambda x: (x[0] < blocks) & (x[1][1] + width <= room)  # noqa: E731
-            block, listed, clear = jax.lax.while_loop(wanted, gather, (block, start, clear))
-            return block, clear, examine(listed, table)
+    def more(carry: Any) -> Any:
+        """The next blocks, until the list is full."""
+        block, clear, table = carry
+        wanted = lambda x: (x[0] < blocks) & (x[1][1] + width <= room)  # noqa: E731
+        block, near_pairs, clear = jax.lax.while_loop(wanted, gather, (block, start, clear))
+        return block, clear, examine(near_pairs, table)
 
-        _, clear, table = jax.lax.while_loop(
-            lambda x: x[0] < blocks, more, (jnp.int32(0), clear, table)
-        )
+    _, clear, table = jax.lax.while_loop(
+        lambda x: x[0] < blocks, more, (jnp.int32(0), clear, table)
+    )
     return table._replace(clear=jnp.minimum(clear, table.clear))
 
 
@@ -454,6 +526,7 @@ def _find_at_once(
     _drift: jax.Array,
     dt: float,
     halves: bool,
+    listed: bool,
 ) -> ContactTable:
     """As `_find_contacts`, of all robots: all their pairs are measured side by side."""
     size, dtype = kept.shape[-1], kept.dtype
@@ -479,6 +552,8 @@ def _find_at_once(
         cells = jnp.asarray(none.T, dtype)[..., None]
         for x, (frame, _shape) in zip(pairs, shown, strict=True):
             found.append(_half(pick(cells, x), frame[12:], units[3:]))
+    if listed:
+        found.append(jnp.repeat(jnp.arange(npair, dtype=dtype), size))
     there = real & (pairs[0] != pairs[1])
     need = jnp.where(there, need.reshape(npair, size), _NONE)
     gap = jnp.where(there, gap.reshape(npair, size), _FAR)
@@ -519,7 +594,8 @@ class ContactTable(NamedTuple):
             positive where boxes stay apart unless other contacts push them together.
         rest: `[_MOST + 1, 8, lanes]` the numbers of both bodies, the normal and the point at the
             end of the step, root's frame [-, m]; the last contact is none. Where they are felt
-            there are two further rows, of the halves of modules: 2 module, 1 more to the right.
+            there are two further rows, of the halves of modules: 2 module, 1 more to the right;
+            and a last one where contacts are listed, of the pair.
         clear: `[lanes]` how far at least boxes are apart at the step's end [m].
     """
 
@@ -626,6 +702,7 @@ class _Contacts(NamedTuple):
         force: `[_MOST, lanes]` [N].
         ends: `[_MOST, 2 or 4, lanes]` numbers of both bodies, and of both halves of modules, see
             `ContactTable`; None where they are not felt.
+        pairs: `[_MOST, lanes]` the number of each; None where they are not listed.
     """
 
     need: jax.Array
@@ -634,6 +711,7 @@ class _Contacts(NamedTuple):
     moved: jax.Array
     force: jax.Array
     ends: jax.Array | None
+    pairs: jax.Array | None
 
     def acceleration(self) -> jax.Array:
         """By all contacts, a response."""
@@ -655,36 +733,26 @@ class _Contacts(NamedTuple):
         numbers = table.rest[:_MOST]
 
         def find_levers(numbers: jax.Array, ahead: BodyFrames) -> jax.Array:
-            number = jnp.arange(len(ahead.position[0]), dtype=numbers.dtype)[:, None]
-            ends = lambda x: weight(number == x[1], x) - weight(number == x[0], x)  # noqa: E731
-            signs = robots.carried([ends(numbers[k]) for k in range(_MOST)])
-            axis = tuple(row[2][1:] for row in ahead.rotation)
-            found = []
-            for k in range(_MOST):
-                normal, point = numbers[k, 2:5], numbers[k, 5:8]
-                arm = tuple(x - p[1:] for x, p in zip(point, ahead.position, strict=True))
-                found.append(signs[k] * dot(axis, cross(arm, tuple(normal))))
-            return jnp.stack(found, 1)
+            return jnp.stack(_levers(robots, ahead, [numbers[k] for k in range(_MOST)]), 1)
 
         kept = weight(self.force > 0, self.force)
         new = fuse(find_levers, inline=True)(numbers, ahead)
         levers = materialize(kept * self.levers + (1 - kept) * new)
         every = [levers[k] for k in range(len(levers))]
         along = lambda hinges: _sum([hinges[k] * x for k, x in enumerate(every)])  # noqa: E731
-        # Contact does no work: boxes part no faster than they met.
-        most = 2 * jnp.maximum(-along(robots.steps), 0) / dt**2
-        # By as much as they near each other in the step, too, which levers at its end do not say of
-        # what turns: `_measure` asks for no more.
-        most = jnp.maximum(most, table.need)
-        need = kept * self.need + (1 - kept) * jnp.minimum(table.need + along(change), most)
+        wanted = _limit_need(table.need, along(robots.steps), along(change), dt)
+        need = kept * self.need + (1 - kept) * wanted
         moved = kept[:, None] * self.moved
         columns = _sum([moved[:, 6 + k][:, None] * x for k, x in enumerate(every)])
         columns = kept[:, None] * (columns + _SOFTNESS * _unit(self.force))
         bodies = self.ends
         if bodies is not None:
-            own = jnp.concatenate([numbers[:, :2], numbers[:, 8:]], 1)
+            own = jnp.concatenate([numbers[:, :2], numbers[:, 8 : 6 + bodies.shape[1]]], 1)
             bodies = kept[:, None] * bodies + (1 - kept[:, None]) * own
-        contacts = _Contacts(need, levers, columns, moved, kept * self.force, bodies)
+        pairs = self.pairs
+        if pairs is not None:
+            pairs = kept * pairs + (1 - kept) * numbers[:, -1]
+        contacts = _Contacts(need, levers, columns, moved, kept * self.force, bodies, pairs)
         return contacts.solve(robots.make_respond(), dt, steady)
 
     def solve(self, respond: Respond, dt: float, steady: bool) -> _Contacts:
@@ -745,6 +813,161 @@ class _Contacts(NamedTuple):
         missing = (1 - taken) * missing + taken * _NONE
         worst = _largest(missing)
         return missing, weight(worst * dt**2 > _ENOUGH, worst)
+
+
+def _levers(robots: Robots, ahead: BodyFrames, contacts: list[jax.Array]) -> list[jax.Array]:
+    """`[nhinge, lanes]` of contacts, each by numbers as of `ContactTable`; see `_Contacts`."""
+    signs = _signs(robots, [(x[0], x[1]) for x in contacts])
+    return [
+        sign * _turning(ahead, tuple(x[2:5]), tuple(x[5:8]))
+        for x, sign in zip(contacts, signs, strict=True)
+    ]
+
+
+def _signs(robots: Robots, ends: list[tuple[jax.Array, jax.Array]]) -> list[jax.Array]:
+    """`[nhinge, lanes]` 1 for a hinge that carries the second of two bodies only, -1 the first."""
+    number = jnp.arange(1 + len(robots.steps), dtype=ends[0][0].dtype)[:, None]
+    one = lambda x: weight(number == x[1], x[1]) - weight(number == x[0], x[0])  # noqa: E731
+    return robots.carried([one(x) for x in ends])
+
+
+def _turning(ahead: BodyFrames, normal: Vec, point: Vec) -> jax.Array:
+    """`[nhinge, lanes]` how fast turning hinges move points along normals [m/rad]."""
+    axis = tuple(row[2][1:] for row in ahead.rotation)
+    arm = tuple(x - p[1:] for x, p in zip(point, ahead.position, strict=True))
+    return dot(axis, cross(arm, normal))
+
+
+def _limit_need(need: jax.Array, steps: jax.Array, change: jax.Array, dt: float) -> jax.Array:
+    """What contacts need of all accelerations by contact, `[_MOST, lanes]` each [m/s²].
+
+    Args:
+        need: beside those by which hinges ended where the contacts were found.
+        steps: by how much boxes part in the step without contact [m].
+        change: by the accelerations by which hinges ended there.
+        dt: of the step [s].
+    """
+    # Contact does no work: boxes part no faster than they met.
+    most = 2 * jnp.maximum(-steps, 0) / dt**2
+    # By as much as they near each other in the step, too, which levers at its end do not say of
+    # what turns: `_measure` asks for no more.
+    return jnp.minimum(need + change, jnp.maximum(most, need))
+
+
+def _differentiable_response(
+    meetings: Meetings, robots: Robots, rounds: jax.Array, dt: float, felt: int
+) -> jax.Array:
+    """Accelerations of all robots by known contacts, and the forces felt, with their derivatives.
+
+    What `_settle` does, with the pairs and forces that it found in each round. By the implicit
+    function theorem those that push keep W λ = need, so that their forces change by
+    W⁻¹ (d need - dW λ).
+
+    Args:
+        meetings: which boxes can meet.
+        robots: all of them.
+        rounds: `[_ROUNDS (2 _MOST + 1), lanes]`, see `_search`.
+        dt: of the step [s].
+        felt: rows of the forces that sensors feel.
+
+    Returns:
+        `[rows + felt, lanes]`.
+    """
+    rounds = rounds.reshape(_ROUNDS, 2 * _MOST + 1, -1)
+    dtype, lanes, hinges = rounds.dtype, rounds.shape[-1], len(robots.steps)
+    body = jnp.asarray(meetings.body, jnp.int32)
+    shapes = meetings.shapes[:-1].reshape(-1, len(meetings.body), meetings.lanes)
+    every = [jnp.asarray(x, jnp.int32) for x in (meetings.first, meetings.second)]
+    at_rest, respond = jnp.asarray(meetings.rest, dtype), robots.make_respond()
+
+    def pick(table: jax.Array, rows: jax.Array) -> jax.Array:
+        """`[..., (n,) lanes]` of `[..., rows, lanes or 1]`, rows `[(n,) lanes]`."""
+        wide = jnp.broadcast_to(table, (*table.shape[:-1], lanes))
+        index = jnp.broadcast_to(rows, (*wide.shape[:-2], rows.size // lanes, lanes))
+        found = jnp.take_along_axis(wide, index, -2)
+        return found if rows.ndim > 1 else found[..., 0, :]
+
+    def look(frames: jax.Array, change: jax.Array, pair: jax.Array, shells: Any, sign: Any) -> Any:
+        """One contact of each robot: what it needs, its levers, their response, what it presses."""
+        pressed, shown = [], []
+        for shell in shells:
+            own = jnp.take(body, shell)
+            here = weight(jnp.arange(frames.shape[1], dtype=jnp.int32)[:, None] == own, frames)
+            shown.append((_sum_by_halves(jnp.moveaxis(frames * here, 1, 0)), pick(shapes, shell)))
+            pressed.append(own.astype(dtype))
+        need, _, *units = _measure(tuple(shown), pick(at_rest, pair), dt)
+        ahead = BodyFrames(
+            tuple(map(tuple, frames[12:21].reshape(3, 3, *frames.shape[1:]))), tuple(frames[21:])
+        )
+        lever = sign * _turning(ahead, tuple(units[:3]), tuple(units[3:]))
+        along = lambda hinges: _sum_by_halves(hinges * lever)  # noqa: E731
+        if meetings.halves is not None and felt > 1 + hinges:
+            cells = jnp.asarray(meetings.halves.T, dtype)[..., None]
+            for shell, (frame, _) in zip(shells, shown, strict=True):
+                half = _half(pick(cells, shell), frame[12:], units[3:])
+                pressed.append(1 + hinges + half)
+        need = _limit_need(need, along(robots.steps), along(change), dt)
+        return need, lever, respond(lever), pressed
+
+    def look_again(before: Any, found: jax.Array) -> tuple[Any, None]:
+        def add(before: Any) -> Any:
+            was, acceleration, *contacts, _ = before
+            change = acceleration[6:] - found[-1] * robots.hurry
+            frames = jnp.stack(jax.tree.leaves(robots.pose(robots.steps + dt**2 * change)))
+            pair = found[_MOST:-1].astype(jnp.int32)
+            shells = [pick(x, pair) for x in every]
+            bodies = [jnp.take(body, x).astype(dtype) for x in shells]
+            signs = jnp.stack(_signs(robots, list(zip(*bodies, strict=True))))
+            new = jax.vmap(partial(look, frames, change))(pair, shells, signs)
+            kept, pushes = weight(was > 0, was), weight(force > 0, force)
+
+            def merge(old: jax.Array, new: jax.Array) -> jax.Array:
+                here = kept.reshape(_MOST, *[1] * (old.ndim - 2), -1)
+                return here * old + (1 - here) * new
+
+            contacts = need, levers, moved, _ = jax.tree.map(merge, tuple(contacts), new)
+            acceleration = _sum([force[k] * moved[k] for k in range(_MOST)])
+            reached = jnp.stack([_sum_by_halves(x * acceleration[6:]) for x in levers])
+            missing = pushes * (need - reached - _SOFTNESS * force)
+            arms, ways = jax.lax.stop_gradient((levers, moved))
+            columns = [_sum_by_halves(jnp.moveaxis(arms * x[6:], 1, 0)) for x in ways]
+            matrix = pushes[:, None] * pushes * jnp.stack(columns, 1)
+            matrix = matrix + _unit(force) * (1 - pushes + _SOFTNESS * pushes)
+            more = _solve(matrix, missing)
+            more = more - jax.lax.stop_gradient(more)
+            acceleration = acceleration + _sum([more[k] * ways[k] for k in range(_MOST)])
+            return force, acceleration, *contacts, force + more
+
+        force = found[:_MOST]
+        changes = any_lane(_largest(jnp.abs(force - before[0])) > 0)
+        return jax.lax.cond(changes, fuse(add, inline=True), lambda x: x, before), None
+
+    zeros = lambda *shape: jnp.zeros((*shape, lanes), dtype)  # noqa: E731
+    ends = [zeros(_MOST)] * (4 if felt > 1 + hinges else 2)
+    none = zeros(_MOST), zeros(_MOST, hinges), zeros(_MOST, 6 + hinges), ends
+    start = zeros(_MOST), zeros(6 + hinges), *none, zeros(_MOST)
+    (_, acceleration, *_, pressed, force), _ = jax.lax.scan(look_again, start, rounds)
+    return jnp.concatenate([acceleration, _felt(force, pressed, felt)]) if felt else acceleration
+
+
+def _solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
+    """`[n, lanes]` from a constant `[n, n, lanes]` with a large diagonal, by Gauss and Jordan."""
+    row = jnp.arange(len(matrix), dtype=jnp.int32)[:, None]
+    for k in range(len(matrix)):
+        own, found = matrix[k] / matrix[k, k], right[k] / matrix[k, k]
+        here = weight(row == k, right)
+        rest = (1 - here) * matrix[:, k]
+        right = (1 - here) * right - rest * found + here * found
+        matrix = (1 - here)[:, None] * matrix - rest[:, None] * own + here[:, None] * own
+    return right
+
+
+def _sum_by_halves(rows: jax.Array) -> jax.Array:
+    """Over the first axis: its derivative has few additions of padded arrays."""
+    while len(rows) > 1:
+        middle = len(rows) // 2
+        rows = jnp.concatenate([rows[:middle] + rows[middle : 2 * middle], rows[2 * middle :]])
+    return rows[0]
 
 
 def _unit(like: jax.Array) -> jax.Array:

@@ -86,7 +86,7 @@ class SingleTree:
         """Which boxes can meet, level after level."""
         first, second = self.pairs.T[..., None]
         boxes = Boxes.of(self.all, like.dtype)
-        return Meetings.of(boxes, self.shells, first, second, self.rest[:, None], True, self.halves)
+        return Meetings.of(boxes, self.shells, first, second, self.rest[:, None], self.halves)
 
     @property
     def touches(self) -> bool:
@@ -133,18 +133,18 @@ class SingleTree:
             return None
         return jax.tree.map(lambda *xs: self.join_rows(xs, like), *map(select, saved))
 
-    def at_lanes(self, which: jax.Array) -> SingleTree:
+    def at_lanes(self, which: jax.Array | None) -> SingleTree:
         """Itself: all lanes are this robot."""
         return self
 
     def saved_at_lanes(
-        self, saved: Any, select: Callable[[Any], Any], which: jax.Array
+        self, saved: Any, select: Callable[[Any], Any], which: jax.Array | None
     ) -> tuple[Any, ...]:
         """Columns of selected saved values; values equal in all lanes are returned unchanged."""
         pick = lambda x: take_lanes(x, which) if np.shape(x)[-1:] not in ((), (1,)) else x  # noqa: E731
         return tuple(jax.tree.map(pick, select(level)) for level in saved)
 
-    def hinge_positions(self, which: jax.Array) -> tuple[Vec, ...]:
+    def hinge_positions(self, which: jax.Array | None) -> tuple[Vec, ...]:
         """The levels' own."""
         return tuple(level.hinges.position for level in self.below if level.hinges is not None)
 

@@ -70,13 +70,13 @@ class Tree(Protocol):
         None without hinges.
         """
 
-    def at_lanes(self, which: Array) -> Self:
-        """Some of the robots, for passes that read no constants of theirs."""
+    def at_lanes(self, which: Array | None) -> Self:
+        """Some of the robots, None for all, for passes that read no constants of theirs."""
 
-    def saved_at_lanes(self, saved: Any, select: Callable[[Any], Any], which: Array) -> Any:
+    def saved_at_lanes(self, saved: Any, select: Callable[[Any], Any], which: Array | None) -> Any:
         """Values that `select` takes from those saved by a pass, for the lanes `which` only."""
 
-    def hinge_positions(self, which: Array) -> Any:
+    def hinge_positions(self, which: Array | None) -> Any:
         """Of some of the robots: joint values of the hinges' places in their parents' frames."""
 
     def unstack_parts(self, groups: tuple[Array, ...]) -> tuple[Any, ...]:

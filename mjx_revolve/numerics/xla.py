@@ -222,8 +222,11 @@ class Graph:
         size: number of stored values.
     """
 
-    def __init__(self, fun: Callable[..., PyTree], examples: PyTree) -> None:
-        """Traces `fun` (of pytrees of arrays) on arguments like `examples`."""
+    def __init__(self, fun: Callable[..., PyTree], examples: PyTree, last: bool = False) -> None:
+        """Traces `fun` (of pytrees of arrays) on arguments like `examples`.
+
+        `last`: it is not differentiated any more, so that derivatives of one's own are dropped.
+        """
         within = _fusing.set(True)
         try:
             closed, shapes = jax.make_jaxpr(fun, return_shape=True)(*examples)
@@ -234,6 +237,9 @@ class Graph:
         self._constants: dict[int, Any] = {}
         self._kept: set[int] = set()
         self._count = 0
+        self._inlined = {"jit": "jaxpr", "pjit": "jaxpr"} | (
+            {"custom_jvp_call": "call_jaxpr"} if last else {}
+        )
         env = {v: self._number() for v in closed.jaxpr.invars}
         self._arguments = list(env.values())
         self._results = self._inline(closed.jaxpr, closed.consts, env)
@@ -339,7 +345,7 @@ class Graph:
         read = lambda v: v if isinstance(v, core.Literal) else env[v]  # noqa: E731
         for eqn in jaxpr.eqns:
             inputs = [read(v) for v in eqn.invars]
-            inner = eqn.params.get("jaxpr") if eqn.primitive.name in ("jit", "pjit") else None
+            inner = eqn.params.get(self._inlined.get(eqn.primitive.name))
             if inner is not None:
                 # jnp.clip, jnp.where and others are jitted functions.
                 inside = dict(zip(inner.jaxpr.invars, inputs, strict=True))
@@ -425,8 +431,10 @@ def _value(values: dict[int, Any], v: Any) -> Any:
     return np.asarray(v.val, v.aval.dtype)
 
 
-def take_lanes(x: jax.Array, which: jax.Array) -> jax.Array:
-    """`x[..., which]` without bounds checks: `which` must be within bounds."""
+def take_lanes(x: jax.Array, which: jax.Array | None) -> jax.Array:
+    """`x[..., which]` without bounds checks: `which` must be within bounds; None: all."""
+    if which is None:
+        return x
     dims = jax.lax.GatherDimensionNumbers(
         offset_dims=tuple(range(x.ndim - 1)), collapsed_slice_dims=(x.ndim - 1,),
         start_index_map=(x.ndim - 1,),
@@ -456,7 +464,7 @@ def fuse_step(
     if not fuses():
         return step, lambda x: x, lambda x: x
     pack, unpack = in_one_array(carry)
-    fused = Graph(step, (carry, row)).in_pieces(
+    fused = Graph(step, (carry, row), last=True).in_pieces(
         _piece_size(carry),
         lambda result: (pack(result[0]), result[1]),
         lambda packed, row: (unpack(packed), row),
@@ -524,7 +532,7 @@ def in_fused_calls(
     """
     if not fuses():
         return lambda *args: pack(fun(*unpack(*args)))
-    return Graph(fun, examples).in_pieces(_piece_size(examples), pack, unpack)
+    return Graph(fun, examples, last=True).in_pieces(_piece_size(examples), pack, unpack)
 
 
 def over_chunks(fun: Callable[[*Ts], R], lanes: int | None = None) -> Callable[[*Ts], R]:
