@@ -14,6 +14,7 @@ from mjx_revolve.engine.robot import Robot
 from mjx_revolve.engine.single_tree import make_single_tree
 from mjx_revolve.engine.state import State
 from mjx_revolve.engine.tree import Tree
+from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.numerics.articulated import to_child
 from mjx_revolve.numerics.inertia import BodyMotion
 from mjx_revolve.numerics.spatial import (
@@ -219,7 +220,13 @@ def body_poses(
 
     Returns:
         Positions [m] and rotations (world from body) in the world frame; body 0 is the world.
+
+    Raises:
+        InputError: qpos has another shape.
     """
+    nq = 7 + robot.num_hinges
+    if len(np.shape(qpos)) != 2 or np.shape(qpos)[1] != nq:
+        raise InputError("qpos", f"[n, {nq}]", list(np.shape(qpos)))
     xp, tree = namespace(qpos), make_single_tree(robot, contact=False)
     columns = qpos.T
     quat = columns[3:7] / xp.linalg.norm(columns[3:7], axis=0)

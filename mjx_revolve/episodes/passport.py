@@ -36,6 +36,7 @@ from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.episodes.starts import Starts, draw_gusts
 from mjx_revolve.inputs.errors import reading
 from mjx_revolve.inputs.schema import Text, checked, read
+from mjx_revolve.inputs.user_code import call_user_function, short_name
 from mjx_revolve.inputs.yaml_reader import dump_yaml, load_yaml
 from mjx_revolve.numerics.xla import over_chunks
 from mjx_revolve.water.bed import bed_height
@@ -197,6 +198,9 @@ def make_passport(fitness: Fitness, genes: Any, seed: int) -> Passport:
 
     Returns:
         The passport; the same bits for the same arguments.
+
+    Raises:
+        InputError: a user's own task does not suit other times.
     """
     genes = jnp.asarray(genes, jnp.float32)
     key = jax.random.fold_in(jax.random.key(seed), PASSPORT_STREAM)
@@ -389,8 +393,17 @@ def fresh_starts(whole: Fitness, usual: Fitness, world: World, key: jax.Array) -
 
 
 def _score(spec: Fitness, chunk: Chunk, track: dict[str, jax.Array]) -> jax.Array:
-    """`[lanes]` scores; NaN below the bed, where an engine without contact has led a robot."""
-    score = spec.score(track, chunk.position, chunk.geometry, chunk.rollout.context).score
+    """`[lanes]` scores; NaN below the bed, where an engine without contact has led a robot.
+
+    Raises:
+        InputError: a user's own task does not suit an episode of this length.
+    """
+    task, given = spec.settings, (track, chunk.position, chunk.geometry, chunk.rollout.context)
+    if task.is_user_code:
+        expected = f"{short_name(task.type)} to score {task.duration:g} s, as passports do"
+        score = call_user_function(task.type, expected, spec.score, *given).score
+    else:
+        score = spec.score(*given).score
     if spec.world.bed is None:
         return score
     x, y, z = (track["position"][:, k] for k in range(3))

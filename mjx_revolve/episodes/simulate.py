@@ -30,7 +30,7 @@ from mjx_revolve.episodes.rollout import (
     with_variation,
 )
 from mjx_revolve.episodes.starts import check_key, draw_gusts, gusty_water, noise_key, target_path
-from mjx_revolve.inputs.errors import InputError
+from mjx_revolve.inputs.errors import InputError, show
 from mjx_revolve.inputs.short_repr import short_repr
 from mjx_revolve.numerics.xla import is_traced, jit
 from mjx_revolve.water.flow import Water, water_of
@@ -226,6 +226,10 @@ def simulate(
         path = draw_gusts(robot.world, jax.random.key(0) if key is None else key, steps, 1)
         water = gusty_water(robot.world, path[..., 0])
     if water is not None:
+        vectors = () if not isinstance(water, Water) else (water.current, water.acceleration)
+        if [isinstance(x, tuple | list) and len(x) for x in vectors] != [3, 3]:
+            expected = "a Water with three numbers in current and in acceleration"
+            raise InputError("water", expected, show(vectors or water))
         water = jax.tree.map(lambda x: _array("water", x, None), water)
         for leaf in jax.tree.leaves(water):
             if leaf.ndim > 1 or (leaf.ndim == 1 and leaf.shape[0] not in (1, steps)):

@@ -6,6 +6,7 @@ of the steps and the columns of `metrics.csv` are here.
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import Field, dataclass, field, replace
@@ -211,7 +212,7 @@ def choose_candidate(
         eligible: `[N]` whether a candidate may win.
         seed: of the run.
         judge: makes a candidate's passport, where that is required: then the best of the best few
-            that passes wins, or the best of all where none does.
+            that passes wins, or the best of all where none does, or where none can be made.
         screen: how likely candidates pass, of many at once: once the best of all has failed, those
             with 0 are not judged, and those with more come first.
 
@@ -239,8 +240,10 @@ def choose_candidate(
         raise InputError("champion", "a score of any candidate", why)
     winner, passport = int(order[0]), None
     if judge is not None:
-        passport = judge(winner)
-        if passport.failed:
+        # A user's own task may not suit a passport's times: the run goes on without, and says why.
+        with contextlib.suppress(InputError):
+            passport = judge(winner)
+        if passport is not None and passport.failed:
             left = [int(k) for k in order[1:] if eligible[k] and means[k] > FAILED_SCORE]
             if left and screen is not None:
                 chances = dict(zip(left, screen(left), strict=True))

@@ -405,7 +405,10 @@ class Run:
         if isinstance(fitness, BodyFitness):
             assert champion.body is not None
             fitness = fitness.body_fitness(champion.body)
-        if champion.passport is None and config.evolution.passport and isinstance(fitness, Fitness):
+        bodies = config.bodies
+        required = bodies is not None and bodies.selection.passport == "required"
+        wanted = config.evolution.passport or required
+        if champion.passport is None and wanted and isinstance(fitness, Fitness):
             say("making the champion's passport")
             try:
                 found = make_passport(fitness, champion.genes, config.evolution.seed)

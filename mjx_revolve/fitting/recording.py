@@ -151,7 +151,9 @@ def load_recording(path: str | Path, robot: Robot, columns: Mapping[str, str]) -
     notes: list[str] = []
     with reading(path):
         if run:
-            signals, notes = _mapped(_read_run(path), rest, robot)
+            swum, own = _read_run(path, robot)
+            signals, notes = _mapped(swum, rest, robot)
+            notes = own + notes
         elif bag:
             signals, notes = _read_bag(path, rest, robot)
         else:
@@ -478,7 +480,9 @@ def _has_names(message: Any, topic: str) -> bool:
 
 def _array(message: Any, topic: str) -> Iterable[tuple[str, float]]:
     dim = message.layout.dim
-    names = dim[0].label.split(",") if dim else map(str, range(len(message.data)))
+    names = dim[0].label.split(",") if dim else []
+    if len(names) != len(message.data):  # none, or a module's name has a comma: by their order
+        names = [*map(str, range(len(message.data)))]
     yield from ((f"command.{n}", x) for n, x in zip(names, message.data, strict=False))
 
 
@@ -512,8 +516,13 @@ _NUMBERS = "Float64", "Float32"
 _MANY = ("JointState", "PointStamped", *_NUMBERS)
 
 
-def _read_run(path: Path) -> dict[str, TimeSeries]:
-    """What the champion of a run folder does, sampled 50 times a second."""
+def _read_run(path: Path, fitted: Robot) -> tuple[dict[str, TimeSeries], list[str]]:
+    """What the champion of a run folder does, sampled 50 times a second; and notes.
+
+    Args:
+        path: of the folder.
+        fitted: robot that is fitted, as the run may have another one.
+    """
     from mjx_revolve.episodes.champion import load_episode
 
     episode = load_episode(path)
@@ -523,7 +532,26 @@ def _read_run(path: Path) -> dict[str, TimeSeries]:
     time = np.asarray(trajectory.time, float)[every - 1 :: every]
     qpos = np.asarray(trajectory.qpos, float)[every - 1 :: every]
     pose = zip(_POSE[:7], qpos.T[:7], strict=True)
-    return sent_commands(robot, trajectory.ctrl) | {name: TimeSeries(time, x) for name, x in pose}
+    signals = {name: TimeSeries(time, x) for name, x in pose}
+    notes, ours, theirs = [], fitted.morphology, robot.morphology
+    for what, number, other, unit in (
+        ("mass", ours.mass, theirs.mass, "kg"),
+        ("volume", 1e6 * ours.volume, 1e6 * theirs.volume, "cm³"),
+    ):
+        if not math.isclose(number, other, rel_tol=1e-3):
+            notes.append(
+                f"the run's robot has a {what} of {other:.4g} {unit}, {ours.name} here "
+                f"{number:.4g}: trimmed (--set trim=neutral), or another one?"
+            )
+    if (varied := trajectory.variation) is not None:
+        words = ", ".join(f"{name} {float(x):.3g}" for name, x in varied._asdict().items())
+        notes.append(f"task.robust: the episode had factors of its own, which a fit finds: {words}")
+    signals = sent_commands(robot, trajectory.ctrl) | signals
+    # The sea's time at the episode's start, which is drawn: waves are those at a recording's times.
+    if robot.world.waves and episode.water is not None:
+        sea = float(np.ravel(episode.water.time)[0])
+        signals = {name: TimeSeries(sea + one.time, one.value) for name, one in signals.items()}
+    return signals, notes
 
 
 def sent_commands(robot: Robot, ctrl: ArrayLike) -> dict[str, TimeSeries]:

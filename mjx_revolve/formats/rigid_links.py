@@ -328,14 +328,14 @@ def _shape(
         missing.append(f"{link}: a shape that is no box, sphere, cylinder, capsule or mesh")
         return
     if kind.tag == "box":
-        size = _numbers(kind, "size", 3, None) / 2
+        size, halves = _numbers(kind, "size", 3, None), [2, 2, 2]
     else:
-        size = _numbers(kind, "radius", 1, None)
+        size, halves = _numbers(kind, "radius", 1, None), [1]
         if kind.tag != "sphere":
-            size = np.append(size, _numbers(kind, "length", 1, None) / 2)
+            size, halves = np.append(size, _numbers(kind, "length", 1, None)), [1, 2]
     if (size <= 0).any():
-        raise InputError(f"link {link}", "sizes > 0", size.tolist())
-    yield _box(kind.tag, size, place, rgb)
+        raise InputError(f"link {link}", f"sizes > 0 of a {kind.tag}", size.tolist())
+    yield _box(kind.tag, size / halves, place, rgb)
 
 
 def _box(kind: str, size: np.ndarray, place: Place, rgb: Color | None) -> Shape:

@@ -91,7 +91,9 @@ def pick_rows(robot: Robot, trajectory: Trajectory) -> tuple[np.ndarray, np.ndar
         raise InputError("rollout", "finite poses", "none")
     every = min(max(1, round(1 / (RATE * timestep))), count)
     rows = np.arange(every - 1, count, every)
-    # From the number of the step: the trajectory's own times are rounded to single precision.
+    # From the number of the step: the trajectory's own times are rounded to single precision. A
+    # replay of many bodies has a row every few steps.
+    timestep *= max(1, round(float(trajectory.time[0]) / timestep))
     return rows, np.round(1e9 * timestep * (rows + 1)).astype(np.int64)
 
 

@@ -92,6 +92,8 @@ SafeLoader.add_implicit_resolver(
 def _construct_mapping(loader: SafeLoader, node: yaml.MappingNode) -> dict[Hashable, Any]:
     mapping: dict[Hashable, Any] = {}
     for key_node, value_node in node.value:
+        if key_node.tag == "tag:yaml.org,2002:merge":
+            raise InputError(_line_of(key_node), "each key by its name", "<<, which merges")
         key = loader.construct_object(key_node, deep=True)
         if not isinstance(key, Hashable):
             raise InputError(_line_of(key_node), "a plain key", show(key))

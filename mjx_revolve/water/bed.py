@@ -74,6 +74,7 @@ def bed_height(bed: Bed, x: Any, y: Any) -> Any:
     Returns:
         z of the bed, world frame [m], same shape.
     """
+    x, y = _real(x), _real(y)
     xp = namespace(x)
     if bed.kind == "flat":
         return xp.full_like(x, bed.height)
@@ -102,6 +103,12 @@ def highest_bed(bed: Bed, reach: float) -> float:
     return float(np.max(bed_height(bed, *np.meshgrid(line, line))))
 
 
+def _real(x: Any) -> Any:
+    """Places as floats: whole numbers would cut the height, or its shape, down to whole ones."""
+    known = hasattr(x, "dtype") and np.issubdtype(x.dtype, np.floating)
+    return x if known else namespace(x).asarray(x, float)
+
+
 def _over(x: Any, number: float) -> Any:
     """A quotient that is rounded alike by NumPy and XLA, which multiplies by the inverse."""
     if isinstance(x, np.ndarray):
@@ -123,6 +130,7 @@ def bed_slope(bed: Bed, x: Any, y: Any) -> tuple[Any, Any]:
     Returns:
         (dz/dx, dz/dy) [-], same shape.
     """
+    x, y = _real(x), _real(y)
     if bed.kind == "flat":
         return jnp.zeros_like(x), jnp.zeros_like(y)
     d = 0.01

@@ -192,6 +192,8 @@ class CurrentField:
         digest = hashlib.sha256()
         shape = []
         for name in ("x", "y", "z", "velocity"):
+            if np.ma.is_masked(getattr(self, name)):  # what stands under a mask is no number
+                raise InputError(name, "numbers at all points", "masked ones")
             given = np.asarray(getattr(self, name))
             if given.dtype.kind not in "iuf":
                 raise InputError(name, "real numbers", given.dtype)

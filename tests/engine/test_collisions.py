@@ -1,6 +1,5 @@
 """Robots that touch: force by hand, momentum, no passing through, worlds apart."""
 
-from dataclasses import replace
 from functools import lru_cache, partial
 
 import jax
@@ -10,8 +9,6 @@ import numpy as np
 import pytest
 
 from laboratory import QUICK, body, box_robot, world
-from mjx_revolve.body.catalogue import MODULES
-from mjx_revolve.body.morphology import make_morphology
 from mjx_revolve.engine import interaction
 from mjx_revolve.engine.batch import fit_capacity, pack_bodies
 from mjx_revolve.engine.batched_trees import make_batched_trees
@@ -25,7 +22,7 @@ from mjx_revolve.engine.interaction import (
 )
 from mjx_revolve.engine.population import PopulationEngine
 from mjx_revolve.engine.robot import build_robot
-from mjx_revolve.engine.spheres import count_spheres, pack_spheres, sphere_box
+from mjx_revolve.engine.spheres import pack_spheres, sphere_box
 from mjx_revolve.episodes.rollout import Rollout, held
 from mjx_revolve.inputs.errors import InputError
 from mjx_revolve.water.flow import water_of
@@ -133,15 +130,6 @@ def test_a_contact_stops_no_more_than_its_mass():
         force, _ = push_of(0.01, 1.0, 0.01, dt, ContactParameters(stiffness=1e9))
         after = -1 + dt * force / 0.01
         assert -1e-6 <= after <= 0.01 / dt + 1e-6
-
-
-def test_what_has_no_contact_has_no_spheres():
-    core = MODULES["Core"]
-    core = replace(core, parts=tuple(replace(part, contact=False) for part in core.parts))
-    tree = {"body": {"type": "Core"}}
-    robot = build_robot(make_morphology(tree, modules=MODULES | {"Core": core}), world())
-    assert count_spheres([robot]) == 0
-    assert pack_spheres([robot], fit_capacity([robot])).radius.shape == (0, 1)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

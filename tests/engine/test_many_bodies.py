@@ -441,15 +441,6 @@ def test_what_it_cannot_do_is_refused_by_name(config, fitness):
     check_refused(kind, fitness, [snake], zeros[:1], None)
 
 
-def test_constants_follow_from_the_types_of_modules_not_from_examples():
-    """A capacity made for a snake, whose parts all point one way, holds any body of its types."""
-    tank = world(**WATER, self_contact=False)  # else boxes that can meet need room, too
-    capacity = fit_capacity([build_robot(body("snake"), tank)], hinges=12, rows=30)
-    groups = tuple(g._replace(parts=12, root_parts=30) for g in capacity.groups)
-    roomy = resize_capacity(capacity, groups=groups)
-    pack_bodies([build_robot(random_body(seed, 5, 6), tank) for seed in range(12)], roomy)
-
-
 def test_modules_of_one_type_may_have_params_of_their_own():
     two = read("""
 body:

@@ -1,6 +1,7 @@
 """Passports: what drifts, chatters or overlaps fails where it should; same seed, same bits."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -14,6 +15,7 @@ from mjx_revolve.episodes.fitness import fit_body
 from mjx_revolve.episodes.passport import Check, Passport, count_reversals, load_passport
 from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.evolution.generations import choose_candidate
+from mjx_revolve.inputs.errors import InputError
 
 TASK = {"type": "directed_swim", "duration": 0.6, "settle": 0.2, "trials": 1}
 
@@ -190,3 +192,20 @@ def test_where_a_passport_is_required_the_best_that_passes_wins(shares, winner, 
     assert found == winner and len(judged) == tried
     assert facts["passport"] == made(kept=shares[winner])
     assert choose_candidate(score, np.ones(3, bool), 0)[1]["passport"] is None
+
+
+def test_a_task_that_does_not_suit_other_times_costs_the_passport_not_the_champion():
+    def fails(*_):
+        raise ValueError("100 rows")
+
+    settings = SimpleNamespace(is_user_code=True, type="mine.py:follow", duration=30.0)
+    chunk = SimpleNamespace(position=0, geometry=0, rollout=SimpleNamespace(context=0))
+    spec = SimpleNamespace(settings=settings, score=fails)
+    why = "mine.py: expected follow to score 30 s, as passports do; found ValueError: 100 rows"
+    check_refused(why, passport._score, spec, chunk, {})
+
+    def judge(_):
+        raise InputError(why)
+
+    found, facts = choose_candidate(lambda *_: (np.ones(1), {}), np.ones(1, bool), 0, judge)
+    assert found == 0 and facts["passport"] is None

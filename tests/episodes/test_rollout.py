@@ -190,6 +190,11 @@ WRONG = [
         "duration: expected 0.5 s, as ctrl has 100 rows of 0.005 s; found 3",
     ),
     ({"qpos": np.zeros(7)}, "qpos: expected shape [9]; found [7]"),
+    (
+        {"water": Water(0.0, (0.1, 0.0))},
+        "water: expected a Water with three numbers in current and in acceleration; "
+        "found ((0.1, 0.0), (0.0, 0.0, 0.0))",
+    ),
 ]
 
 

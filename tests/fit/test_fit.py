@@ -553,12 +553,6 @@ def test_errors_are_of_what_was_recorded():
     fit = Prediction("swim", np.arange(3.0), none, found, found + 0.1, found)
     assert fit.error(fit.fitted, False) == pytest.approx(0.1 * np.sqrt(3))
     assert fit.error(fit.before, False) == 0 and np.isnan(fit.error(fit.fitted, True))
-    # What has no simulated value, such as the beginning of a mean speed, is no hit.
-    half = found + 0.1
-    half[0] = np.nan
-    whole = np.full((3, 3), 0.2)
-    fit = Prediction("swim", np.arange(3.0), none, whole, np.vstack([half[:1], whole[1:] + 0.1]), 0)
-    assert fit.error(fit.fitted, False) == pytest.approx(0.1 * np.sqrt(3))
 
 
 def test_names_of_modules_may_end_like_units(tmp_path):

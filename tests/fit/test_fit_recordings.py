@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from test_fit import felt, write_csv
 from mjx_revolve import fit as command
 from mjx_revolve.body.morphology import load_morphology, make_morphology
 from mjx_revolve.engine.robot import build_robot
+from mjx_revolve.engine.variation import Variation
 from mjx_revolve.episodes.simulate import Trajectory
 from mjx_revolve.fitting import TimeSeries, load_recording, make_noisy, run, simulate_signals
 from mjx_revolve.fitting.axes import find_other_axes
@@ -18,6 +20,7 @@ from mjx_revolve.fitting.problem import FitSettings, make_problem
 from mjx_revolve.fitting.recording import read_map
 from mjx_revolve.formats.ros_bag import write_bag as write_ros_bag
 from mjx_revolve.inputs.commands import run_command
+from mjx_revolve.water.flow import water_of
 from mjx_revolve.water.world import load_world
 
 FREE = ["drag", "thrust"]
@@ -215,6 +218,26 @@ def test_thrusters_of_a_bag_have_the_commands_before_their_lag(auv, tmp_path):
     found = load_recording(tmp_path / "swim.mcap", auv, {}).signals
     for k, name in enumerate(auv.morphology.thruster_names):
         np.testing.assert_allclose(found[f"command.{name}"].value, ctrl[0, k])
+
+
+def test_a_run_folder_has_the_sea_and_the_factors_of_its_episode(auv, tmp_path, monkeypatch):
+    """Waves began at time 0, and `task.robust` was not mentioned: fits found either as drag."""
+    time, count = auv.world.timestep * np.arange(1, 81), auv.mj_model.nu
+    qpos = np.c_[0.1 * time, np.zeros((80, 2)), np.tile([1.0, 0, 0, 0], (80, 1))]
+    none = np.zeros((80, 6)), np.zeros((80, 3, 3)), np.zeros((80, count)), np.zeros(80)
+    factors = Variation(drag=1.25, motor=0.8)
+    swum = Trajectory(time, qpos, *none, variation=factors)
+    (tmp_path / "run.json").write_text("{}")
+    world = load_world("lake", waves=[{"amplitude": 0.05, "wavelength": 2.0}])
+    sea = build_robot(auv.morphology, world)
+    for robot, first in ((auv, 0.0), (sea, 946.5)):
+        water = water_of(robot.world)._replace(time=946.5)
+        episode = SimpleNamespace(robot=robot, trajectory=swum, water=water)
+        monkeypatch.setattr("mjx_revolve.episodes.champion.load_episode", lambda _, e=episode: e)
+        found = load_recording(tmp_path, robot, {})
+        assert found.signals["command.bow"].time[0] == first
+        np.testing.assert_allclose(found.signals["x"].time, first + time[3::4])
+        assert "drag 1.25, added_mass 1, density 1, motor 0.8" in found.notes[0]
 
 
 def test_an_exported_brains_node_needs_no_labels(auv, signals, tmp_path):

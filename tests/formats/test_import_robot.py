@@ -242,6 +242,7 @@ def test_the_command_writes_what_other_commands_read(tmp_path, capsys, monkeypat
 ("\n<robot", '<?xml version="1.0" encoding="GB2312"?><robot', "expected XML; found: multi-byte"),
 ('"0.4"', '"heavy"', "<mass> value: expected 1 numbers; found 'heavy'"),
 ('"0.4"', '"0"', "base: expected a root with a mass; found none"),
+("0.1 0.06 0.04", "0.1 -0.06 0.04", "link base: expected sizes > 0 of a box; found [0.1, -0.06"),
 ('<child link="left"', '<child link="lft"', "joint hip: expected a link of the file; f"),
 ("</robot>", '<link name="alone"/></robot>', "expected one root link; found base, alone"),
 ("</robot>", '<link name="rod"/></robot>', "link rod: expected each name once; found 2 of it"),

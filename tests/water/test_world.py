@@ -308,6 +308,15 @@ def test_lake_is_always_the_same_and_has_shore_slope_and_basin():
     assert np.diff(np.sign(np.diff(first[60], 2))).any()  # dunes
 
 
+@pytest.mark.parametrize("bed", [LAKE, Bed(height=-2.5)], ids=["lake", "flat"])
+def test_whole_numbers_are_places_as_others_are(bed):
+    x, y = np.array([200, -300]), np.array([3, 50])
+    exact = bed_height(bed, 1.0 * x, 1.0 * y)
+    assert np.array_equal(bed_height(bed, x, y), exact)
+    assert float(bed_height(bed, 200, 3)) == pytest.approx(exact[0], abs=1e-4)
+    assert np.shape(bed_slope(bed, 200, 3)) == (2,)
+
+
 def test_slope_against_finite_differences():
     """Central differences in float64 over 2 cm: the same numbers; over 1 mm: to what dunes bend."""
     import jax
