@@ -21,7 +21,7 @@ from mjx_revolve.control.readings import (
 )
 from mjx_revolve.control.table import CONTROLLERS
 from mjx_revolve.engine.plant import Plant
-from mjx_revolve.inputs.errors import InputError, reading, show
+from mjx_revolve.inputs.errors import InputError, note, reading, show
 from mjx_revolve.inputs.user_code import (
     call_user_function,
     function_place,
@@ -54,6 +54,8 @@ def find_controller(
     """
     if settings.rate is not None:
         paced = plant.at_rate(settings.rate)
+        if paced.rate and paced.rate < 0.999 * settings.rate:
+            note(f"controller.rate: {paced.rate:g} Hz, one command at each of the world's steps")
         limit = (paced.rate or settings.rate) / 2
         if settings.fastest > limit:  # where the world's steps are longer than 1 / rate
             most = f"waves of at most {limit:g} Hz, half as many as the world's steps"

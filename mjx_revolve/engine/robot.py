@@ -7,6 +7,7 @@ import copy
 import io
 import math
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +26,7 @@ from mjx_revolve.engine.step_constants import inertia_boxes
 from mjx_revolve.inputs.errors import InputError, note
 from mjx_revolve.inputs.packages import check_package
 from mjx_revolve.water.drag import drags_whole_bodies, find_drag_law
+from mjx_revolve.water.mujoco_drag import ELLIPSOID, INERTIA_BOX
 from mjx_revolve.water.world import World
 
 
@@ -259,7 +261,21 @@ def build_robot(morphology: Morphology, world: World) -> Robot:
     if not all(map(_is_sound, kinds.values())):
         _ = robot.mj_model  # raises where MuJoCo refuses it
     _note_soft_bed(morphology, world)
+    if world.drag in (INERTIA_BOX.name, ELLIPSOID.name):
+        _note_factors(kinds.values(), world)
     return robot
+
+
+def _note_factors(kinds: Iterable[ModuleType], world: World) -> None:
+    """A remark where parts have factors on drag, which MuJoCo's laws take as they are."""
+    parts = (part for kind in kinds for part in kind.parts if part.drag is None)
+    found = {name for part in parts for name, _ in part.factors} - _OF_ADDED_MASS
+    for name in sorted(found):
+        note(f"factors on {name} have no effect: drag: {world.drag} is MuJoCo's, as it is")
+
+
+# Factors that all drag laws leave to what parts carry.
+_OF_ADDED_MASS = {"added_mass", "added_mass_coefficient", "entrained_water"}
 
 
 def _note_soft_bed(morphology: Morphology, world: World) -> None:

@@ -231,6 +231,17 @@ class BodiesConfig(Settings):
         drawn = selection.type in ("map_elites", "random")
         if selection.tournament != usual["tournament"].default and drawn:
             note(f"bodies.selection.tournament has no effect: {selection.type} holds none")
+        if selection.max_age is not None and drawn:
+            note(f"bodies.selection.max_age has no effect: {selection.type} removes none by age")
+        own = BrainsConfig.model_fields["mutation"].default
+        if self.brains.inheritance == "none" and self.brains.mutation != own:
+            note("bodies.brains.mutation has no effect, as no brain is inherited")
+        learning, usual = self.learning, LearningConfig.model_fields
+        if learning.strategy != usual["strategy"].default and learning.generations == 1:
+            drawn_only = "with one generation brains are drawn around that of birth"
+            note(f"bodies.learning.strategy has no effect: {drawn_only}")
+        if learning.std_init != usual["std_init"].default and learning.trials == 1:
+            note("bodies.learning.std_init has no effect: one brain is tried, that of birth")
         if self.learning.strategy_params and self.learning.generations == 1:
             none = "none, as with one generation no strategy learns"
             raise ConstraintError("learning.strategy_params", none, "some")

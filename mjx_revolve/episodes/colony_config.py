@@ -13,6 +13,7 @@ from annotated_types import Ge, Le, Unit
 from pydantic import model_validator
 
 from mjx_revolve.episodes.settings import Settings
+from mjx_revolve.inputs.errors import note
 from mjx_revolve.inputs.schema import (
     ConstraintError,
     Integer,
@@ -137,6 +138,11 @@ class ColonyConfig(Settings):
         if self.life.window > self.life.max_age:
             most = f"at most life.max_age ({self.life.max_age:g} s), or fitness is never measured"
             raise ConstraintError("life.window", most, f"{self.life.window:g}")
+        if self.life.childhood >= self.life.max_age:
+            note(
+                f"colony.life: all robots live for childhood ({self.life.childhood:g} s), however "
+                f"fit they are, as max_age ({self.life.max_age:g} s) is no longer"
+            )
         if self.energy is not None:
             self._check_energy(self.energy)
         return self
@@ -145,6 +151,10 @@ class ColonyConfig(Settings):
         if energy.start > energy.capacity:
             most = f"at most the capacity ({energy.capacity:g} J)"
             raise ConstraintError("energy.start", most, f"{energy.start:g}")
+        usual = type(energy).model_fields
+        own = [x for x in ("power", "most", "reach") if getattr(energy, x) != usual[x].default]
+        if own and not energy.chargers:
+            note(f"colony.energy: {', '.join(own)} without effect, as there are no chargers")
         for k, (x, y, _) in enumerate(energy.chargers):
             if max(abs(x), abs(y)) > self.arena.size / 2:
                 inside = f"a place in the arena (x and y within {self.arena.size / 2:g} m)"

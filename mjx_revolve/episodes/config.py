@@ -41,7 +41,7 @@ from mjx_revolve.episodes.settings import (
     map_files,
     one_of,
 )
-from mjx_revolve.inputs.errors import InputError, reading
+from mjx_revolve.inputs.errors import InputError, note, reading
 from mjx_revolve.inputs.files import check_path, short_path
 from mjx_revolve.inputs.overrides import copy_plain, merge_override, read_overrides, sets
 from mjx_revolve.inputs.schema import (
@@ -91,6 +91,17 @@ TO_TARGETS = ("reach_target", "search", "escape")
 # Tasks that count less away from a depth, and those that look along `direction`.
 _AT_DEPTH = ("directed_swim", "speed", "follow_course", "escape", "follow_bed", "crawl")
 _DIRECTED = ("directed_swim", "hold_heading", "follow_bed", "crawl")
+# Of episodes, which a colony does not have while its robots live.
+_OF_EPISODES = (
+    "robust",
+    "current_std",
+    "energy_weight",
+    "start_attitude",
+    "start_tilt",
+    "target",
+    "target_distance",
+    "course_spread",
+)
 
 
 def _check_measure(name: str) -> str:
@@ -372,6 +383,8 @@ class TaskConfig(Section):
         for name in (name for name, needs in level.items() if needs and upright):
             what = f"one that is not upright, as there is {name}, which is level"
             raise ConstraintError("direction", what, _plain(self.direction))
+        if level["a horizon"] and self.direction[2] != 0 and not upright:
+            note("task.horizon: the way that is foretold is level, direction's z does not count")
         if math.hypot(*self.direction) < 1e-9:
             raise ConstraintError("direction", "a vector of some length", _plain(self.direction))
         return self
@@ -466,6 +479,8 @@ class Config(Settings):
             raise ConstraintError("controller.type", what, "brain")
         if self.engine != "population":
             raise ConstraintError("engine", "population, as bodies evolve", self.engine)
+        if self.allow_overlap:
+            note("allow_overlap has no effect, as bodies evolve: those that overlap are refused")
         if self.evolution.passport == "required":
             what = "true or false, as bodies evolve (bodies.selection.passport asks for it)"
             raise ConstraintError("evolution.passport", what, "required")
@@ -498,6 +513,11 @@ class Config(Settings):
         if colony.arena.depth <= self.task.depth:
             least = f"more than task.depth ({self.task.depth:g} m), at which robots are born"
             raise ConstraintError("colony.arena.depth", least, f"{colony.arena.depth:g}")
+        defaults = type(self.task).model_fields
+        own = [x for x in _OF_EPISODES if getattr(self.task, x) != defaults[x].default]
+        if own:
+            names = ", ".join(f"task.{name}" for name in own)
+            note(f"{names}: of the episodes by which the champion is chosen; no robot lives by it")
 
     _source: str = PrivateAttr("config")
     _overrides: _Overrides = PrivateAttr(_Overrides())

@@ -37,7 +37,8 @@ class LiftDrag:
     Attributes:
         a0: angle of attack at zero lift [rad].
         cla: lift slope before the stall [1/rad].
-        cda: drag slope before the stall [1/rad].
+        cda: drag slope before the stall [1/rad]; of fins with `drag: fin_wake`, the default, drag
+            follows from lift there instead.
         alpha_stall: stall angle [rad].
         cla_stall: lift slope after the stall [1/rad].
         cda_stall: drag slope after the stall [1/rad].

@@ -253,7 +253,7 @@ def load_world(name: str | Path, **overrides: Any) -> World:
     if overrides:
         with reading(f"world {world.name}"):
             world = read(World, fields | {"current_field": world.current_field} | overrides)
-    return _note_of_density(world)
+    return _note_unread(_note_of_density(world))
 
 
 def _find_world(name: str | Path) -> Path:
@@ -285,6 +285,34 @@ def _note_of_density(world: World) -> World:
             f"world {world.name}: density: found {world.density:g} kg/m³, which is no water's "
             f"({low} to {high})"
         )
+    return world
+
+
+def _note_unread(world: World) -> World:
+    """The world; notes of fields that change nothing beside the others.
+
+    Where a module has a drag law of its own, that may still read some.
+    """
+    shear, chains = world.shear, ("cross_flow", "plate_wake", "fin_wake")
+    unread = {
+        "lift_drag is of drag: lift_drag and fin_wake, and fins have their own": (
+            world.lift_drag != LiftDrag() and world.drag not in ("lift_drag", "fin_wake")
+        ),
+        f"coefficients are of drag: {', '.join(chains)}": (
+            world.coefficients != () and world.drag not in chains
+        ),
+        "water_depth is of waves (the ground is bed)": (
+            world.water_depth is not None and not world.waves
+        ),
+        "shear.exponent is of profile: power": (
+            shear is not None and shear.profile != "power" and shear.exponent != Shear.exponent
+        ),
+        "surface_tension acts with buoyancy: partial and mask": (
+            world.surface_tension is not None and world.buoyancy == "off"
+        ),
+    }
+    for why in (why for why, found in unread.items() if found):
+        note(f"world {world.name}: no effect: {why}")
     return world
 
 
