@@ -307,6 +307,7 @@ def _note_unread(world: World) -> World:
         "shear.exponent is of profile: power": (
             shear is not None and shear.profile != "power" and shear.exponent != Shear.exponent
         ),
+        "near_surface is of added_mass": world.near_surface and not world.added_mass,
         "surface_tension acts with buoyancy: partial and mask": (
             world.surface_tension is not None and world.buoyancy == "off"
         ),
