@@ -73,7 +73,7 @@ class Meetings(NamedTuple):
         rest: by how much the boxes of each pair overlap at rest [m].
         count: `[lanes]` or `[1]` how many pairs a robot has, int32.
         halves: `[nshell, 5]` the module of each, the way to its right and its middle along that
-            way, body frame [m]; None of many different robots.
+            way, body frame [m]; None in `BatchedTrees`.
     """
 
     lanes: int
@@ -87,8 +87,8 @@ class Meetings(NamedTuple):
 
     @property
     def steady(self) -> bool:
-        """Whether loops are to have a known length: of one body, XLA:CPU aborts over others."""
-        return self.lanes == 1
+        """Whether loops have a known length: in a `SingleTree` XLA:CPU aborts over others."""
+        return self.halves is not None
 
     @staticmethod
     def of(
