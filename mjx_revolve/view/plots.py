@@ -142,7 +142,10 @@ def limit_to_most(axes: Axes, low: Sequence[np.ndarray], high: Sequence[np.ndarr
 
 def whole_numbers(axes: Axes, count: int = 6) -> None:
     """Ticks of the horizontal axis at about `count` round whole numbers."""
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10], nbins=count))
+    # One tick is enough: the default of two would split the single generation of a short run.
+    axes.xaxis.set_major_locator(
+        MaxNLocator(integer=True, steps=[1, 2, 5, 10], nbins=count, min_n_ticks=1)
+    )
 
 
 def panels(figure: Figure, count: int, columns: int, xlabel: str = "", **share: Any) -> list[Axes]:
