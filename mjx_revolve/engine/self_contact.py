@@ -43,7 +43,7 @@ from mjx_revolve.numerics.boxes import (
     weight,
 )
 from mjx_revolve.numerics.spatial import Vec, cross
-from mjx_revolve.numerics.xla import fuse, materialize, on_cpu, take_lanes
+from mjx_revolve.numerics.xla import fuse, materialize, on_cpu, split_arrays, take_lanes
 
 # Contacts of one robot at a time. A choice: few robots have more.
 _MOST = 8
@@ -122,7 +122,7 @@ def contact_acceleration(
             negative where that is not known.
         touched: `[lanes]` whether they did not stay apart before. Those that did not are looked at
             together: a few robots take as long as the one with the most contacts.
-        values: all of the robots that has arrays.
+        values: what `look_at` reads. Its arrays have derivatives; a `SingleTree` has none.
         look_at: (such values, which lanes, int32, None: all) → the robots in them.
         rows: of a response.
         dt: of the step [s].
@@ -131,19 +131,12 @@ def contact_acceleration(
     Returns:
         As a response; the clearance as it is known then; and the forces that are felt.
     """
-    # A function with a derivative of its own takes all arrays that it reads. Numbers stay numbers,
-    # so that what they make 0 is left out.
-    leaves, structure = jax.tree.flatten((meetings, values))
-    traced = [k for k, x in enumerate(leaves) if isinstance(x, jax.Array)]
-
-    def fill(arrays: list[jax.Array]) -> tuple[Meetings, Callable[[jax.Array | None], Robots]]:
-        given = dict(zip(traced, arrays, strict=True))
-        filled = [given.get(k, x) for k, x in enumerate(leaves)]
-        pairs, values = jax.tree.unflatten(structure, filled)
-        return pairs, partial(look_at, values)
+    # A function with a derivative of its own takes all arrays that it reads.
+    arrays, fill = split_arrays((meetings, values))
 
     def search(listed: bool, arrays: Any, clearance: jax.Array, touched: jax.Array) -> jax.Array:
-        pairs, robots = fill(arrays)
+        pairs, own = fill(arrays)
+        robots = partial(look_at, own)
         return _search(pairs, clearance, touched, robots, rows, dt, felt, listed)
 
     solve = jax.custom_jvp(partial(search, False))
@@ -154,14 +147,14 @@ def contact_acceleration(
         found, contacts = found[: rows + 1 + felt], found[rows + 1 + felt :]
 
         def respond(arrays: Any) -> jax.Array:
-            pairs, robots = fill(arrays)
-            return _differentiable_response(pairs, robots(None), contacts, dt, felt)
+            pairs, own = fill(arrays)
+            return _differentiable_response(pairs, look_at(own, None), contacts, dt, felt)
 
         _, change = jax.jvp(respond, primals[:1], tangents[:1])
         still = jnp.zeros_like(found[:1])
         return found, jnp.concatenate([change[:rows], still, change[rows:]])
 
-    found = solve([leaves[k] for k in traced], clearance, touched)
+    found = solve(arrays, clearance, touched)
     return found[:rows], found[rows], found[rows + 1 :]
 
 
@@ -211,9 +204,8 @@ def _search(
         solved = _settle(meetings, which, wanted, look_at(which), rows, dt, felt, listed)
         return jnp.where(wanted, solved, start)
 
-    found: jax.Array = jax.lax.cond(
-        any_lane(wanted), fuse(look) if on_cpu() else look_at_all, lambda: start
-    )
+    see = fuse(look) if on_cpu() else look_at_all
+    found: jax.Array = jax.lax.cond(any_lane(wanted), see, lambda: start)
     return found
 
 
@@ -933,8 +925,7 @@ def _differentiable_response(
             columns = [_sum_by_halves(jnp.moveaxis(arms * x[6:], 1, 0)) for x in ways]
             matrix = pushes[:, None] * pushes * jnp.stack(columns, 1)
             matrix = matrix + _unit(force) * (1 - pushes + _SOFTNESS * pushes)
-            more = _solve(matrix, missing)
-            more = more - jax.lax.stop_gradient(more)
+            more = _solve(matrix, missing - jax.lax.stop_gradient(missing))
             acceleration = acceleration + _sum([more[k] * ways[k] for k in range(_MOST)])
             return force, acceleration, *contacts, force + more
 

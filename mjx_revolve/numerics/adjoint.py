@@ -53,8 +53,8 @@ def fused_back(
         carry: an example of the carry.
         row: an example of the loop's input in one step; it has no gradient.
         offset: an example; added to a value within the step, for the gradient by that value.
-        loops: whether the step has loops over lanes. Their derivatives have scatters and unused
-            parameters, which XLA:CPU takes in no call, so that the backward step has none then.
+        loops: whether the step has loops over lanes. XLA:CPU takes them in no call beside a
+            derivative, so that the backward step has none then.
 
     Returns:
         (forward, backward). Forward: (carry, row) → carry, without an offset. Backward: (gradient

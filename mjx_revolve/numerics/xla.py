@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from typing import Any, NamedTuple, TypeVar, TypeVarTuple
 
@@ -182,15 +182,23 @@ def fuse_outermost(fun: Callable[[*Ts], R], *args: *Ts) -> R:
     """
     if _fusing.get() or not is_traced(*args):
         return fun(*args)
-    # Numbers stay numbers: what they make 0 or 1 is left out.
-    leaves, tree = jax.tree.flatten(args)
-    arrays = [k for k, x in enumerate(leaves) if isinstance(x, jax.Array)]
+    arrays, fill = split_arrays(args)
+    return fuse(lambda xs: fun(*fill(xs)), inline=True)(arrays)
 
-    def of_arrays(*xs: jax.Array) -> R:
-        given = dict(zip(arrays, xs, strict=True))
-        return fun(*jax.tree.unflatten(tree, [given.get(k, x) for k, x in enumerate(leaves)]))
 
-    return fuse(of_arrays, inline=True)(*(leaves[k] for k in arrays))
+def split_arrays(tree: PyTree) -> tuple[list[jax.Array], Callable[[Sequence[jax.Array]], PyTree]]:
+    """The arrays of a pytree, and what puts others in their places.
+
+    Numbers stay numbers: what they make 0 or 1 is left out while a function is traced.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    places = [k for k, x in enumerate(leaves) if isinstance(x, jax.Array)]
+
+    def fill(arrays: Sequence[jax.Array]) -> PyTree:
+        given = dict(zip(places, arrays, strict=True))
+        return jax.tree.unflatten(structure, [given.get(k, x) for k, x in enumerate(leaves)])
+
+    return [leaves[k] for k in places], fill
 
 
 def fuse_call(fun: Callable[[*Ts], R]) -> Callable[[*Ts], R]:
